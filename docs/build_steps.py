@@ -30,7 +30,7 @@ class MathML:
 
     @staticmethod
     def block(writer: Any, node: nodes.math_block) -> None:
-        """Write a formula on a line of its own."""
+        """Write a formula on its own line."""
         writer.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
         raise nodes.SkipNode
 

@@ -187,7 +187,7 @@ class _Collocation:
 
     def _start(self, x: Array, courses: Sequence[Array]) -> dict[str, Array]:
         errors, x = self.errors, np.array(x)
-        shared = x[: errors.unknowns.shared]  # what a variable starts with tells its size, which is never zero
+        shared = x[: errors.unknowns.shared]  # solvers scale variables by their start: avoid zero
         shared[np.abs(shared) < LEAST] = LEAST
         start = errors.places.values(x)
         for label, course in zip(self.labels, courses):

@@ -3,7 +3,7 @@
     A(q) x = sum_c B_c(q) f_c(u_c) + d,    y = x + C(q)/D(q) e,    f_c = mu_cᵀ eta_c
 
 The sum of squared innovations e is minimised (Ljung 1999, section 7.2). C = D = 1 is output error, whose e are the
-simulation errors; D = A is ARMAX, ``A y = sum_c B_c f_c + d + C e``; Box-Jenkins has a D of its own. All are
+simulation errors; D = A is ARMAX, ``A y = sum_c B_c f_c + d + C e``; Box-Jenkins has its own D. All are
 procedures: several starts, Gauss-Newton descents on streamed sensitivities (`optid.identify.prediction_error`) and, at
 the optimum z0 or under constraints, convex programmes in the tangent of the iterate, for any conic or quadratic back
 end,
@@ -71,7 +71,7 @@ def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: 
         constraints: builders such as ``formulations.constraints.shape.monotone("increasing")`` or ``lambda v: {...}``.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
         offset: True for one constant of the equation, "each" for one for every experiment (and stretch between missing
-            inputs), as of sensors with other zeros; False holds it at zero, for centred data.
+            inputs), where sensors have different zeros; False holds it at zero, for centred data.
         starts: number of starts that are compared. Of output error at most: three suffice where they agree on a model
             that explains nine tenths of the output.
         seed: of the random starts.

@@ -78,7 +78,7 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
             covariance of the errors, iterated); "auto" is "variance" for simulation and "determinant" (maximum
             likelihood of Gaussian noise) for prediction.
         offset: True for one constant of every output, "each" for one in every experiment (and stretch between missing
-            inputs), as of sensors with other zeros, in models without feedback; False takes the record as it is.
+            inputs), where sensors have different zeros, in models without feedback; False takes the record as it is.
         feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
         stability: "stable" keeps every iterate stable (for prediction, its predictor), with the feedback taken as a
             given signal; "free" lets the poles go where the errors are smallest, for plants that integrate or grow

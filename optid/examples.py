@@ -85,7 +85,7 @@ def thruster(seed: int = 0, n: int = 600, noise: float | None = None) -> Example
 def broken_thruster(seed: int = 0, n: int = 400) -> Example:
     """Return the rig of `thruster` with a propeller that breaks after five eighths of the record.
 
-    From then on the thrust that the current drives is half of what it was; input, dynamics and noise are of the same
+    From then on the current drives half the thrust; input, dynamics and noise are of the same
     kind. For `optid diagnose`, with a state-space model of `thruster`.
     """
     rng = np.random.default_rng([seed, 2])

@@ -1,7 +1,7 @@
 """Formulations, constraints and renderers by name: entry points, so that a third party's are on equal footing."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from functools import cache
 from html import escape
@@ -147,6 +147,21 @@ def named_constraint(text: str) -> Any:
         return build(*positional, **keywords)
     except TypeError as error:
         raise StructureError(f"constraint {text!r}: {error}; it is used as {word}{inspect.signature(build)}") from None
+
+
+def read_constraints(constraints: Any) -> tuple[Any, ...]:
+    """Return constraints as a tuple of builders; a text alone, or a callable alone, is one constraint.
+
+    Raises:
+        LookupFailed, StructureError: as `named_constraint`.
+        StructureError: neither a text, a callable nor a sequence of them.
+    """
+    if isinstance(constraints, str) or callable(constraints):
+        constraints = (constraints,)
+    if constraints is None or isinstance(constraints, Mapping) or not isinstance(constraints, Iterable):
+        raise StructureError(f"constraints = {constraints!r}: must be a text such as 'monotone:increasing', a function "
+                             "of the named variables, or a list of these")
+    return tuple(named_constraint(one) if isinstance(one, str) else one for one in constraints)
 
 
 def check_arguments(name: str, function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:

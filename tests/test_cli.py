@@ -20,7 +20,7 @@ from optid.cli.terminal import spread
 from optid.core.program import programme_of
 from optid.descriptions import describe
 from optid.examples import EXAMPLES, example
-from optid.registry import CONSTRAINTS, FORMULATIONS, registered
+from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, registered
 from optid.solving.solve import solve
 
 
@@ -311,6 +311,21 @@ def test_completion_in_a_shell():
         assert done.stdout.split()[: len(words)] == words
 
 
+@pytest.mark.parametrize(("name", "group"), [("bj.exact", FORMULATIONS), ("fault.profile", FAULTS)])
+def test_one_formulation_is_explained(name, group):
+    found, shown = describe(registered(group)[name]), run("formulations", name)
+    text = " ".join(shown.output.split())
+    assert shown.exit_code == 0 and found.summary.split(".")[0][:40] in text
+    assert all(f"--{key.replace('_', '-')} " in text for key in found.options if key != "constraints")
+    assert all(word in text for word in found.variables)
+    assert ("optid.fit(data, 'bj.exact', na=..., nb=..., nc=..., nd=...)" in text) == (name == "bj.exact")
+
+
+def test_an_unknown_formulation_is_not_explained():
+    shown = run("formulations", "bj.exct")
+    assert shown.exit_code == 2 and "Did you mean 'bj.exact'?" in shown.output
+
+
 def test_formulations_name_their_variables():
     text = " ".join(run("formulations").output.split())
     assert "variables: Theta a b mu offset" in text and "variables: Theta a offset" in text
@@ -499,7 +514,7 @@ def test_fit_without_orders_searches_for_them(csv, short_ladder):
 
 
 @pytest.mark.parametrize("words, said", [
-    (("--classes", "wiener"), "use one of linear"), (("--budget", -1), "above 0"), (("--workers", 0), "workers"),
+    (("--classes", "wiener"), "use one of linear"), (("--budget", -1), "budget must be"), (("--workers", 0), "workers"),
     (("--horizon", 0), "horizon"), (("--solver", "nosuch"), "no solver"), (("--constraint", "nosuch"), "no constraint"),
 ])
 def test_identify_refuses_what_cannot_be(csv, words, said):

@@ -15,7 +15,7 @@ from test_fault_injection import small
 
 from optid.errors import ModelFileError, StructureError
 from optid.faults import Answer, Certificate, Diagnosis, Estimate, dictionary, load_diagnosis, scan, thresholds
-from optid.faults.consistency.leftover import alarm_probability, left_over
+from optid.faults.consistency.leftover import alarm_probability, remainder_test
 from optid.faults.diagnosis.answers import Remaining
 from optid.faults.diagnosis.posterior import (
     SPREADS,
@@ -167,7 +167,7 @@ def test_intervals_hold_the_size_although_the_onset_is_searched():
 
 def test_the_tests_of_the_rest_keep_their_level(found):
     p_values = np.array([
-        left_over(noise(found, 100, seed), noise(found, 100, seed).r, 0).p_value for seed in range(1500)])
+        remainder_test(noise(found, 100, seed), noise(found, 100, seed).r, 0).p_value for seed in range(1500)])
     for level in (0.02, 0.1):
         assert np.mean(p_values <= level) < level + 3 * np.sqrt(level / 1500)
 
@@ -176,7 +176,7 @@ def test_a_line_in_the_rest_is_found_with_its_frequency_and_direction(found):
     white = noise(found, 200)
     tone = np.outer(np.sin(2 * np.pi * 0.2 * np.arange(200)), [1.2, 0.0])
     rest = replace(white, r=white.r + tone)
-    seen = left_over(rest, rest.r, 0)
+    seen = remainder_test(rest, rest.r, 0)
     assert seen.test == "period" and seen.p_value < 1e-6
     assert seen.frequency == pytest.approx(0.2, abs=0.006) and seen.share > 0.2
     along = np.linalg.solve(found.predictor.root, [1.0, 0.0])
@@ -188,8 +188,8 @@ def test_a_burst_in_the_rest_is_found(found):
     white = noise(found, 300)
     r = white.r.copy()
     r[120:123] += [3.0, -3.5]
-    assert left_over(white, r, 0).test == "burst"
-    assert left_over(white, r, 0).p_value < 1e-4
+    assert remainder_test(white, r, 0).test == "burst"
+    assert remainder_test(white, r, 0).p_value < 1e-4
 
 
 def test_the_p_value_of_an_alarm_is_its_level_at_the_threshold_and_fits_a_simulation():

@@ -461,7 +461,7 @@ def test_a_basis_has_no_more_functions_than_the_samples_determine():
 
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("changes, error, words", [
-    ({"budget": 0}, StructureError, "budget is a number of seconds"), ({"effort": "much"}, StructureError, "effort"),
+    ({"budget": 0}, StructureError, "budget must be a positive number"), ({"effort": "much"}, StructureError, "effort"),
     ({"effort": 0}, StructureError, "effort=0"), ({"effort": np.nan}, StructureError, "effort"),
     ({"blocks": 1}, StructureError, "blocks"),
     ({"classes": ["wiener"]}, StructureError, "wiener"), ({"horizon": 0}, StructureError, "horizon"),

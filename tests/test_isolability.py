@@ -16,6 +16,7 @@ from optid.cli.app import app
 from optid.errors import DataError, LookupFailed, StructureError
 from optid.faults import Fault, dictionary, inject, whiten
 from optid.faults.isolability import GRID, MIDDLE
+from optid.faults.isolability_page import write
 from optid.faults.search.calibration import family_thresholds
 from optid.faults.search.sweeps import sweep
 
@@ -196,15 +197,23 @@ def run(*words):
     return CliRunner().invoke(app, ["isolability", *map(str, words)])
 
 
+def test_the_page_has_a_row_for_every_fault_and_the_printed_matrix(tmp_path):
+    found = dictionary(small()).isolability(40, calibration=5000, draws=100)
+    page = write(found, tmp_path / "page.html", command="optid isolability model.json").read_text(encoding="utf-8")
+    assert all(f"<td>{label}" in page or f"{label}</th>" in page for label in found.labels)
+    assert page.count("optid isolability model.json") == 1 and str(found).splitlines()[0] in page
+    assert "http://" not in page.replace("http://www.w3.org", "") and "Isolability matrix" in page
+
+
 @pytest.mark.slow
 def test_command(tmp_path):
     model = small()
     model.save(tmp_path / "model.json")
     done = run(tmp_path / "model.json", "--window", 40, "--load", "pump=0.3,-0.2,0.5", "--draws", 200, "--picture",
-               tmp_path / "p.png", "--kinds", "bias", "drift")
+               tmp_path / "p.png", "--report", tmp_path / "p.html", "--kinds", "bias", "drift")
     assert done.exit_code == 0, done.output
     assert "process:pump drift" in done.output and "window 40 samples" in done.output
-    assert (tmp_path / "p.png").stat().st_size > 10_000
+    assert all((tmp_path / f"p.{ending}").stat().st_size > 10_000 for ending in ("png", "html"))
     replace(model, noise=None).save(tmp_path / "silent.json")
     for words, message in ((["silent.json"], "noise covariances"), (["model.json", "--load", "pump"], "NAME="),
                            (["model.json", "--onset", "soon"], "--onset"), (["none.json"], "none.json")):

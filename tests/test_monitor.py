@@ -431,7 +431,7 @@ def test_a_loss_without_excitation_gets_no_verdict_alone():
     _, events = watched(found, u, Fault.loss("actuator:u1", 250, 1.0), 5, 50, 30.0)
     (named,) = [event for event in events if event.kind == "isolated"]
     assert named.candidates[0][0] == "actuator:u1 stuck"
-    assert named.sample >= 250 + 10 and "not isolable from a constant" in named.note
+    assert named.sample >= 250 + 10 and "looks like a constant bias" in named.note
 
 
 def test_a_spike_is_a_spike():
@@ -446,7 +446,7 @@ def test_refusals_name_what_is_wrong(tmp_path):
     found = everything(model)
     some = {label: 30.0 for label in found.labels if label != "sensor:y1"}
     usual = {"model": model, "faults": found, "thresholds": np.full(len(found.labels), HIGH)}
-    monitor, unlike = watch(model, found), "sample 1: .* 2 and 2 numbers are needed"
+    monitor, unlike = watch(model, found), "sample 1: .* give 2 and 2 numbers"
     assert monitor.step([0.0, None], [0.0, 0.0]) == []  # missing
     refused(
         *((StructureError, words, lambda how=how: Monitor(**(usual | how))) for how, words in (

@@ -213,7 +213,7 @@ def test_what_is_no_record_in_parts_is_refused(record, folders, tmp_path):
     frame.to_parquet(tmp_path / "above" / "below" / "x.parquet")
     refuses(DataError, "below.*one per experiment", optid.open_stream, tmp_path / "above")
     refuses(DataError, "list of sources is empty", optid.open_stream, [])
-    refuses(DataError, "use read for what is in memory", optid.open_stream, frame)
+    refuses(DataError, "use read for data in memory", optid.open_stream, frame)
     refuses(DataError, "more channels than samples", optid.open_stream, da.zeros((2, 9)))
     refuses(DataError, "3 dimensions", optid.open_stream, da.zeros((9, 2, 2)))
     refuses(DataError, "different lengths", optid.open_stream, {"u": da.zeros(9), "y": da.zeros(8)})

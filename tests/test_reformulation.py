@@ -225,8 +225,10 @@ def test_rules_hold_and_binding_ones_are_named(healthy, faults):
     assert np.all(np.diff(mu) >= -1e-7) and np.all(np.diff(mu) <= np.diff(before) + 1e-7)
     again = run(actuator(refitting(healthy, data, damaged(1)), constraints=["monotone:increasing"]))
     assert again.model.model.nonlinearities[1].mu.shape == (6,)
-    with pytest.raises(StructureError, match="'default'"):
-        actuator(refitting(healthy, data, damaged(1)), constraints="monotone")
+    alone = run(actuator(refitting(healthy, data, damaged(1)), constraints="monotone:increasing"))
+    assert np.array_equal(alone.model.model.nonlinearities[1].mu, again.model.model.nonlinearities[1].mu)
+    with pytest.raises(LookupFailed, match="'defaults'"):
+        actuator(refitting(healthy, data, damaged(1)), constraints="defaults")
     assert run(actuator(refitting(healthy, data, damaged(1)), constraints=[monotone("increasing")])).model
 
 

@@ -4,6 +4,8 @@ import copy
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
+from html import escape
 
 import numpy as np
 import pytest
@@ -12,8 +14,9 @@ from sample_fits import example_fit, linear_fit, mimo_fit
 
 import optid
 from formulations import shape
-from optid.errors import DataError, LookupFailed, StructureError
+from optid.errors import DataError, LookupFailed, SolverFailed, StructureError
 from optid.examples import example
+from optid.phrases import p_equals, p_value, plural
 
 RESULTS = {
     "fit": lambda: example_fit("thruster"), "several outputs": mimo_fit,
@@ -45,7 +48,7 @@ def test_parameters_are_a_table_with_errors():
     assert [list(fit.params[name][1:5]) for name in table] == list(table.values())
     assert fit.params.names[-10:] == tuple(f"mu{k}" for k in range(1, 11))
     np.testing.assert_allclose(fit.params.estimates[-10:], fit.model.f.mu)
-    frame = fit.params.to_frame()
+    frame = fit.params.to_pandas()
     assert frame.loc["a1", "estimate"] == fit.params["a1"].estimate
     with pytest.raises(LookupFailed, match="Did you mean"):
         _ = fit.params["al"]
@@ -159,3 +162,61 @@ def test_the_stub_for_editors_is_that_of_the_signatures():
     finally:
         sys.path.remove("docs")
     assert STUB.read_text(encoding="utf-8") == stub(), "run python docs/stub.py"
+
+
+def test_a_notebook_shows_a_record_and_a_verdict_as_tables():
+    fit = example_fit("thruster")
+    record = fit.data._repr_html_()
+    assert f"thruster: {fit.data.n_samples} samples every" in record and record.count("<tr>") == 3
+    assert all(f"<td>{name}</td>" in record for name in (*fit.data.inputs, *fit.data.outputs))
+    judged = fit.verdict._repr_html_()
+    assert f"The model on this record: {fit.verdict.word}" in judged
+    assert all(f"<td>{part.name}</td><td>{escape(part.value)}</td>" in judged for part in fit.verdict.parts[:12])
+
+
+def test_a_fit_in_a_line_says_structure_verdict_fit_and_status_and_computes_nothing():
+    fit = optid.fit(example("dead_zone").data, na=2, nb=2, basis="triangular:8", constraints="monotone:increasing")
+    before = set(vars(fit))
+    first = repr(fit)
+    assert set(vars(fit)) == before and "verdict not computed" in first
+    assert first.startswith("Fit(hammerstein_arx.exact na=2 nb=2 basis=triangular:8 1 constraint, ")
+    word = fit.verdict.word
+    assert f"verdict {word}, fit {fit.verdict.score:.1f} %" in repr(fit) and "optimal" in repr(fit)
+    assert "na=[1, 2]" in repr(replace(fit, arguments={"na": (1, 2), "nb": np.ones(3)}))
+
+
+def test_a_fit_has_the_poles_and_the_equation_of_its_model():
+    fit = linear_fit()
+    np.testing.assert_allclose(np.sort(fit.poles), np.sort(np.roots([1, -0.5, 0.2])), atol=1e-6)
+    assert fit.equation == "y(k) = 0.5 y(k-1) - 0.2 y(k-2) + 2 u(k-1) - 3"
+    none = optid.fit(fit.data, "arx", na=2, nb=1, nk=1, raises=False,
+                     constraints=lambda v: {"low": v["a"][0] <= -1, "high": v["a"][0] >= 1})
+    for name in ("poles", "equation"):
+        with pytest.raises(SolverFailed, match="no model: its status is infeasible"):
+            getattr(none, name)
+
+
+def test_one_constraint_needs_no_list():
+    data = example("dead_zone").data
+    alone, listed = (optid.fit(data, na=2, nb=2, basis="triangular:8", constraints=given)
+                     for given in ("monotone:increasing", ["monotone:increasing"]))
+    assert np.array_equal(alone.model.f.mu, listed.model.f.mu) and [p.name for p in alone.prices] == [
+        "monotone:increasing"]
+    for call in (optid.fit, optid.identify):
+        with pytest.raises(LookupFailed, match="called 'monotonic'"):
+            call(data, constraints="monotonic:increasing")
+        refuses(StructureError, "constraints = 3", call, data, constraints=3)
+
+
+@pytest.mark.parametrize(("p", "digits", "cell", "words"), [
+    (0.0, 2, "< 1e-16", "p < 1e-16"), (2e-218, 1, "< 1e-16", "p < 1e-16"), (1e-16, 1, "1e-16", "p = 1e-16"),
+    (0.0312, 2, "0.031", "p = 0.031"), (1.0, 2, "1", "p = 1"), (np.nan, 2, "-", "p = -")])
+def test_p_values_below_rounding_are_bounds(p, digits, cell, words):
+    assert (p_value(p, digits), p_equals(p, digits)) == (cell, words)
+
+
+def test_one_is_written_in_the_singular():
+    assert [plural(n, "sample") for n in (0, 1, 2, 3000)] == ["0 samples", "1 sample", "2 samples", "3,000 samples"]
+    assert plural(3000, "sample", "") == "3000 samples"
+    data = optid.Data(np.ones(1), np.ones(1), 1.0)
+    assert all("1 sample every" in text for text in (repr(data), str(data), data._repr_html_()))

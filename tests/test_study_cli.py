@@ -349,10 +349,10 @@ def test_a_place_that_takes_no_files_is_told_before_any_work(folder, monkeypatch
 
 def test_names_from_files_reach_the_terminal_without_their_control_characters(capfd):
     from optid.cli.study_summary import print_reasons
-    from optid.cli.terminal import note, say
+    from optid.cli.terminal import note, print_text
 
     hostile = "\x1b]0;title\x07\x1b[31mred\x9b2J\u202egnp"
-    say(hostile)
+    print_text(hostile)
     note(hostile)
     print_reasons({"outcome": np.array(["error"], object), "status_verified": np.array([""], object),
                    "reached": np.array([False]), "solver": np.array([hostile], object),

@@ -82,7 +82,7 @@ def test_an_order_that_goes_in_a_circle_cannot_be_told():
     for k, (one, other) in enumerate([(0, 1), (1, 2), (2, 0)]):
         times[10 * k : 10 * k + 10, one], times[10 * k : 10 * k + 10, other] = 1.0, 2.0
     verdict = conclude(table_of(times))
-    assert verdict.headline.word == "Cannot tell" and "goes in a circle: each of a, b and c" in verdict.headline.text
+    assert verdict.headline.word == "Cannot tell" and "no order: of a, b and c, each is" in verdict.headline.text
     assert verdict.recommended == ()
 
 

@@ -67,7 +67,7 @@ for name, value, low, high in rows:
     print(f"{name}: {value:.3g} (95 %: {low:.3g} to {high:.3g})")
 
 # %%
-# What is known is said in the terms of the plant: here the gain, from a balance. The dead time becomes sharper.
+# State what you know in the terms of the plant: here the gain, from a balance. The dead time becomes sharper.
 known = optid.fit(data, "process.exact", process="P1D", constraints=["K:0.4"])
 known.dynamics
 

@@ -1,7 +1,7 @@
 """Constraints on responses: of a state-space model in the step that chooses B and D with A and C held.
 
 With ``Theta_c = functions x [B_c; D_c]`` the effect of an input on an output after k samples is linear in Theta:
-``C A^(k-1) B`` and, at once, D. Positive realness is a linear matrix inequality in (B, D) and a matrix P of its own
+``C A^(k-1) B`` and, at once, D. Positive realness is a linear matrix inequality in (B, D) and an auxiliary matrix P
 when it is stated on the transposed system. The step response of a polynomial model, too, can be kept in a band, by its
 tangent. ``channel`` and ``output`` are names, needed where there are several.
 """

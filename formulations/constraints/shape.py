@@ -17,7 +17,8 @@ observer gain is held at its mean there. The rules of `formulations.constraints.
 Every rule takes the name of an input as ``channel`` (None means every input, or the only one where a static
 characteristic is meant) and, about a static characteristic, that of an output, where there are several. Rules about
 shape also take a latent signal, "z1", "z2", ...: those on the slope of its function (monotone, even, dead zones) only
-where it has one of its own, as in Wiener models; elsewhere what is linear in z may stand in the matrices as well.
+where it is determined, as in Wiener models; otherwise the linear part of the function is not identifiable separately
+from the matrices.
 """
 
 from collections.abc import Callable, Sequence
@@ -301,8 +302,8 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
 
     def build(view: View) -> Any:
         if direction == "decreasing" and channel in view.spans:
-            raise StructureError(f"what decreases in {channel} increases in -{channel}, which gives the same outputs: "
-                                 "ask for increasing")
+            raise StructureError(f"the sign of {channel} is arbitrary, so that 'decreasing' and 'increasing' are "
+                                 "equivalent: use 'increasing'")
         found = [Limit(_rows(view, one, rows) @ curve >= 0, bound=one,
                        step=_range_of(view.basis(one), curve) if heights else None, words=RANGE if heights else "")
                  for one in _inputs(view, channel) for curve in view.curves(one)]
@@ -324,7 +325,7 @@ def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -
 
 
 def _rows(view: View, channel: str, rows: Callable[[Any], np.ndarray]) -> np.ndarray:
-    """Return the rows of a condition; refuse one on the slope of a latent function that has none of its own."""
+    """Return the rows of a condition; refuse one on the slope of a latent function, if it is not determined."""
     basis = view.basis(channel)
     found, span = rows(basis), view.spans.get(channel)
     if span is None:
@@ -333,8 +334,8 @@ def _rows(view: View, channel: str, rows: Callable[[Any], np.ndarray]) -> np.nda
     straight = np.linalg.lstsq(basis.values(z), z)[0]
     apart = np.abs(straight - span @ (span.T @ straight)).max() > 1e-9 * np.abs(straight).max()
     if apart and np.abs(found @ straight).max() > 1e-9 * np.abs(found).max():
-        raise StructureError(f"the slope of the function of {channel} is not determined: what is linear in the "
-                             "latent signal may stand in A, B, C and D as well. Ask for convex, concave or odd")
+        raise StructureError(f"the slope of the function of {channel} is not determined: its linear part is not "
+                             "identifiable separately from A, B, C and D. Use convex, concave or odd")
     sizes = np.linalg.norm(found @ span, axis=1)
     return found[sizes > 1e-9 * sizes.max()]  # the others hold for every function: natural splines end straight
 

@@ -132,7 +132,7 @@ def _proof_of(solution: Solution) -> ParityProof | None:
 
 
 def _between(candidate: Candidate, unit: Signature, first: int, last: int) -> Signature:
-    """Columns of which some combination is the fault with any onset from first to last; last = N: any course."""
+    """Basis that contains the signature for every onset in [first, last]; for last = N every time course."""
     k, jump = np.arange(len(unit[0])), candidate.kind == "jump"
     courses = [k == at for at in range(first, min(last + jump, k.size))]
     if last < k.size and not jump:

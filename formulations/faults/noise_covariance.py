@@ -38,7 +38,7 @@ def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", l
     """Match the covariances of a window.
 
     Args:
-        found: the candidates: those of kind "noise", or, where there are none, every place of the others.
+        found: the noise candidates; if there are none, one for each place in the dictionary.
         whitened: the window; one experiment.
         form: "places" (non-negative variances of the candidates) or "full" (covariances of any noise).
         lags: largest lag; None for the settling of the predictor, at most a tenth of the window.

@@ -20,10 +20,9 @@ import numpy as np
 from formulations.constraints.rule import Rule
 from optid.core.problem import Problem
 from optid.core.terms import Squares, Values
-from optid.errors import StructureError
 from optid.faults.repair.refitting import Refitting
 from optid.program.solution import Bound, Status
-from optid.registry import named_constraint
+from optid.registry import read_constraints
 from optid.solving.solve import Evidence, Procedure
 
 Array = np.ndarray
@@ -99,8 +98,6 @@ class Refitted:
 def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, constraints: Sequence[Any] | str
           ) -> Problem:
     """State the problem linearised at theta: one sum of squares, of the record and of the prior."""
-    if isinstance(constraints, str) and constraints != "default":
-        raise StructureError(f"constraints={constraints!r}: a list of rules, or 'default'.")
     believed, wanted = problem.believed()
     rows = np.vstack([np.pad(s, ((0, 0), (0, len(problem.curves)))), believed])
     q = rows.shape[1]
@@ -112,10 +109,11 @@ def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, const
     by_column = np.concatenate([*(part.ravel(order="F") for part in places), np.arange(theta.size, q)]).astype(int)
     misfit = Squares(factor[:q, by_column], factor[:q, q], rest, names)  # of the record, and of what is believed
     rules: list[Any] = []
-    for curve in () if not isinstance(constraints, str) else problem.curves:
-        rules += [] if curve.dead else _not_stronger(curve)
-    if not isinstance(constraints, str):
-        rules = [named_constraint(rule) if isinstance(rule, str) else rule for rule in constraints]
+    if isinstance(constraints, str) and constraints == "default":
+        for curve in problem.curves:
+            rules += [] if curve.dead else _not_stronger(curve)
+    else:
+        rules = list(read_constraints(constraints))
 
     def restrict(view: Any) -> dict[str, Any]:
         still = [key for key, part in problem.slices.items() if problem.held[part].any()]

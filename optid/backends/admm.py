@@ -64,8 +64,8 @@ def minimise(problem: NuclearProblem, weight: float, gap: float = 1e-7, limit: i
         outside, moved = np.linalg.norm(reached - low_rank), np.linalg.norm(low_rank - before)
         sizes = np.linalg.norm(scaled) / max(float(np.linalg.norm(low_rank)), 1e-300)
         change = FIRST[1] if count <= FIRST[0] else FACTOR
-        # the step grows where the constraint lags behind, and shrinks where the matrix does; the measure lies between
-        # that of absolute and that of relative residuals, either of which circles for thousands of iterations
+        # the step grows where the constraint lags behind, and shrinks where the matrix does; balance by the geometric
+        # mean of absolute and relative residual ratios: with either alone the penalty oscillates
         lag = outside * np.sqrt(sizes)
         factor = change if lag > BALANCE * moved else 1.0 / change if moved > BALANCE * lag else 1.0
         factor = 1.0 if count > limit // 2 else factor

@@ -15,7 +15,7 @@ from optid.cli.look import look
 from optid.cli.monitoring import monitor
 from optid.cli.options import register
 from optid.cli.studies import study
-from optid.cli.terminal import Command, Group, say
+from optid.cli.terminal import Command, Group, print_text
 
 app = typer.Typer(
     cls=Group,
@@ -30,7 +30,7 @@ def _version(wanted: bool) -> None:
     if wanted:
         from optid import __version__
 
-        say(f"optid {__version__}")
+        print_text(f"optid {__version__}")
         raise typer.Exit
 
 

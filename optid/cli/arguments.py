@@ -68,7 +68,7 @@ def record(files: Sequence[Path | str] | None, how: Mapping[str, Any], example: 
     return chosen.data, dict(chosen.suggestion)
 
 
-def suited(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
+def drop_foreign_options(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
     """Return the suggested arguments that the formulation takes (`LookupFailed` for an unknown one)."""
     from optid.registry import formulation as look_up
 
@@ -90,7 +90,7 @@ def at_stamps(how: dict[str, Any], formulation: str) -> dict[str, Any]:
     return {**how, "gaps": "stamps"} if any_times and how["gaps"] is None and how["resample"] is None else how
 
 
-def as_modelled(how: Mapping[str, Any], model: Any) -> dict[str, Any]:
+def options_of_model(how: Mapping[str, Any], model: Any) -> dict[str, Any]:
     """Return the reading options with channels and sampling time of a model where none are given."""
     return {
         **how,

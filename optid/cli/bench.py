@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from optid.cli.options import File, Paths
-from optid.cli.terminal import hearing, say
+from optid.cli.terminal import capture_warnings, print_text
 
 
 def workbench(data: Paths = None, example: str | None = None, *, how: dict[str, Any], model: File = None,
@@ -21,7 +21,7 @@ def workbench(data: Paths = None, example: str | None = None, *, how: dict[str, 
     """
     from optid.cli import arguments as words
 
-    with hearing():
+    with capture_warnings():
         record: Any
         record, suggestion = words.record(data, how, example, seed)
         plant = None if model is None else words.state_space_model(model)
@@ -37,7 +37,7 @@ def workbench(data: Paths = None, example: str | None = None, *, how: dict[str, 
         [str(Path(name).resolve()) for name in data or ()], words.reading(how))
 
     def ready(address: str, redirect: Path) -> None:
-        say(f"The workbench is at {address}\nIt ends with Ctrl-C; nothing leaves this machine.")
+        print_text(f"The workbench is at {address}\nIt ends with Ctrl-C; nothing leaves this machine.")
         if browser:
             import webbrowser
 

@@ -11,7 +11,7 @@ from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
 from optid.cli.results import check_folders, check_names, command_line
 from optid.cli.studies import NOTHING_SOLVED, Workers, follow_progress
-from optid.cli.terminal import note, print_table, say
+from optid.cli.terminal import note, print_table, print_text
 from optid.descriptions import describe
 from optid.lazy import import_cvxpy
 from optid.registry import FORMULATIONS, entry_point
@@ -56,7 +56,7 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
 
     check_folders(report, db)
     entry, suggestion = _entry(data, how, example, seed)
-    arguments = words.suited(suggestion, formulation) if suggestion else {}
+    arguments = words.drop_foreign_options(suggestion, formulation) if suggestion else {}
     arguments |= words.pairs(settings, "--set")
     needed = describe(entry_point(FORMULATIONS, formulation)).options
     assumed = {key: ASSUMED[key] for key, parameter in needed.items()
@@ -85,7 +85,7 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
         from optid.studies.page import write_page
 
         write_page(verdict_on_one_record(rows), report, command=command_line())
-        say(f"report written to {report}")
+        print_text(f"report written to {report}")
     if not found.lines:
         raise typer.Exit(NOTHING_SOLVED)
 
@@ -138,16 +138,17 @@ def _show(found: Any, formulation: str, record: str) -> None:
                 ("solver", "verified", "excess", "residual", "cold", "warm", "1-step", "simul."), table,
                 firm=(0, *range(2, 8)), right=range(2, 8), padding=(0, 0, 0, 1))
     for reason, solvers in found.reasons.items():
-        say(Text(f"{listed(solvers, most=20)}: {reason}", "dim"))
+        print_text(Text(f"{listed(solvers, most=20)}: {reason}", "dim"))
     unfit = []
     for solver, reason in found.refused.items():
         if solver in absent or not found.lines:  # with what to install, or which solvers take it
-            say(Text(f"{solver}: {reason}", "dim"))
+            print_text(Text(f"{solver}: {reason}", "dim"))
         else:
             unfit.append(solver)
     if unfit:
-        say(Text(f"not applicable to {formulation}: {', '.join(unfit)}", "dim"))
-    say(Text("optimal: proved globally optimal. excess: relative distance of the objective from the best. "
-             "residual: largest residual of the optimality conditions, verified by optid (constraints, "
-             f"complementarity, and gradient / {GRADIENT:g}). 1-step, simul.: fit in % on held-out samples.", "dim"))
-    say(Text(found.recommendation, "bold"))
+        print_text(Text(f"not applicable to {formulation}: {', '.join(unfit)}", "dim"))
+    print_text(Text("optimal: proved globally optimal. excess: relative distance of the objective from the best. "
+                    "residual: largest residual of the optimality conditions, verified by optid (constraints, "
+                    f"complementarity, and gradient / {GRADIENT:g}). 1-step, simul.: fit in % on held-out samples.",
+                    "dim"))
+    print_text(Text(found.recommendation, "bold"))

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from optid.cli.options import descriptions, option_of
-from optid.cli.terminal import Command, complain, exit_code
+from optid.cli.terminal import Command, exit_code, print_error
 from optid.descriptions import describe
 from optid.errors import LookupFailed
 from optid.registry import FORMULATIONS, entry_point
@@ -46,7 +46,7 @@ class FittingCommand(Command):
 
 
 def _refused(error: LookupFailed) -> typer.Exit:
-    complain(error)
+    print_error(error)
     return typer.Exit(exit_code(error))
 
 

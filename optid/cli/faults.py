@@ -11,7 +11,7 @@ ZERO = "INPUT=VALUE, the input at which the actuator has no effect"
 
 def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: float = 0.95, false_alarm: float = 0.01,
                 kinds: Words = None, load: Words = None, disturbance: Words = None, state_jump: bool = True,
-                draws: int = 1000, seed: int = 0, picture: File = None) -> None:
+                draws: int = 1000, seed: int = 0, report: File = None, picture: File = None) -> None:
     """Compute the smallest size at which each fault is detectable and isolable; needs no data.
 
     Example: optid isolability model.json --window 100 --load pump=0.5,-0.3,0.4,0.2 --picture isolability.png
@@ -30,7 +30,7 @@ def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: fl
 
     if onset != "unknown" and not onset.isdecimal():
         raise StructureError(f"--onset {onset}: must be the number of a sample, or unknown")
-    with working(picture) as work:
+    with working(report, picture) as work:
         from optid.faults import dictionary
 
         plant = words.state_space_model(model)
@@ -42,6 +42,10 @@ def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: fl
         study = found.isolability(window, onset=onset if onset == "unknown" else int(onset), prob=prob,
                                   false_alarm=false_alarm, draws=draws, seed=seed)
         work.text = str(study)
+        if report is not None:
+            from optid.faults.isolability_page import write
+
+            work.write("report", report, lambda path: write(study, path, command=command_line()))
         work.draw(study.plot, picture)
 
 

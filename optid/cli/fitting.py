@@ -55,7 +55,7 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
         from optid.identify.selection import fit_by_holdout
         from optid.show.printing import describe, describe_advice
 
-        arguments = words.suited(suggestion, formulation) if suggestion else {}
+        arguments = words.drop_foreign_options(suggestion, formulation) if suggestion else {}
         arguments |= words.pairs(settings, "--set") | ({"constraints": constraint} if constraint else {})
         if arguments.get("constraints") == ["none"]:
             del arguments["constraints"]

@@ -1,12 +1,18 @@
 """The commands that list solvers, formulations, constraints, examples and simulated systems."""
 
+import re
+import textwrap
 from importlib.metadata import EntryPoint
 
 from rich.text import Text
 
-from optid.cli.terminal import Waiting, print_table
+from optid.cli.options import option_of
+from optid.cli.terminal import Spinner, print_table, print_text
 from optid.descriptions import Description, describe, describe_function
-from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, registered
+from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, entry_point, registered
+
+_SECTION = re.compile(r"(Args|Raises|Returns|Warns|Attributes|Named variables):")
+"""Paragraphs of a docstring that are no text."""
 
 CLASSES = ("LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one")
 
@@ -14,7 +20,7 @@ CLASSES = ("LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one")
 def solvers() -> None:
     """List the solvers: the problem classes that each accepts, and whether it is installed."""
     rows = []
-    with Waiting() as waiting:
+    with Spinner() as waiting:
         waiting.step("asking the back ends")
         from optid.backends.choice import back_ends
 
@@ -30,9 +36,18 @@ def solvers() -> None:
                 "computed. warm: accepts a starting point. here: installed.", firm=(0, 1))
 
 
-def formulations() -> None:
-    """List the formulations, their arguments and the variables for constraints."""
-    with Waiting() as waiting:
+def formulations(name: str | None = None) -> None:
+    """List the formulations, or explain one: its arguments and the variables for constraints.
+
+    Example: optid formulations bj.exact
+
+    Files:
+        name (NAME): Formulation to explain.
+    """
+    if name is not None:
+        _explain(name)
+        return
+    with Spinner() as waiting:
         waiting.step("loading the formulations")
         fits, faults = _entries(FORMULATIONS), _entries(FAULTS)
     print_table("Formulations", ("formulation", "problem"), fits,
@@ -76,6 +91,28 @@ def systems() -> None:
                 "samples and noise are the defaults of a study; noise is relative to the noise-free output. na, nb and "
                 "nk are those of the system.",
                 right=range(1, 6))
+
+
+def _explain(name: str) -> None:
+    """Print the docstring of a formulation or of a fault programme, its arguments and its variables."""
+    known = registered(FAULTS)
+    found = describe(known[name] if name in known else entry_point(FORMULATIONS, name))
+    head, _, rest = found.text.partition("\n\n")
+    more = [part for part in re.split(r"\n\n", rest) if not _SECTION.match(part)] if rest else []
+    for part in (head, *more):
+        print_text(textwrap.fill(" ".join(part.replace("`", "").split()), 80) + "\n")
+    about = found.arguments()
+    rows = [(Text(option_of(key), "bold"), "required" if one.default is one.empty else f"{one.default}",
+             about.get(key, "")) for key, one in found.options.items() if key != "constraints"]
+    print_table(name, ("option", "default", "meaning"), rows,
+                f"In Python: optid.fit(data, {name!r}, {', '.join(_required(found)) or '...'})." * (name not in known))
+    if found.variables:
+        print_text(textwrap.fill("Constraints may name: " + ", ".join(found.variables) + ". With several inputs the "
+                                 "name has the input, as mu[valve].", 80))
+
+
+def _required(found: Description) -> list[str]:
+    return [f"{key}=..." for key, one in found.options.items() if one.default is one.empty]
 
 
 def _entries(group: str) -> list[tuple[Text, Text]]:

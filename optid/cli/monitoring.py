@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 from optid.cli.faults import ZERO
 from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
-from optid.cli.terminal import Waiting, hearing, note
+from optid.cli.terminal import Spinner, capture_warnings, note
+from optid.phrases import p_equals
 
 if TYPE_CHECKING:
     from optid.cli.state_file import StateFile
@@ -50,7 +51,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     Example: optid monitor model.json --arl0 10000 < stream.csv
 
     The record:
-        follow (-f FILE): Read this file and follow what is appended to it. [dim]standard input[/]
+        follow (-f FILE): Read this file and follow it as it grows. [dim]standard input[/]
         until_end: Stop at the end of the followed file.
         fill_gaps (N): Insert at most N missing samples where the time stamps have a gap.
         strict: Stop at the first unreadable row.
@@ -89,10 +90,10 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     check_folders(thresholds)
     check_folders(state, writable=False)
     with nullcontext() if state is None else StateFile(state) as kept:
-        with hearing() as heard, Waiting() as waiting:
+        with capture_warnings() as heard, Spinner() as waiting:
             waiting.step("reading")
             plant = words.state_space_model(model)
-            how = words.as_modelled(how, plant)
+            how = words.options_of_model(how, plant)
             reading = words.reading(how)
             channels = {key: reading.pop(key) for key in ("inputs", "outputs", "dt", "time")}
             if reading.pop("experiment") is not None:
@@ -154,7 +155,7 @@ def _doubt(plant: Any, origin: Any) -> None:
 
     judged = health(whiten(plant, origin))
     if not (judged.white and judged.scaled):
-        note(f"whiteness of the innovations of the record of the identification: p = {judged.p_value:.2g}, size "
+        note(f"whiteness of the innovations of the record of the identification: {p_equals(judged.p_value)}, size "
              f"{judged.ratio:.2f} times the predicted one: thresholds for white noise are too low. Calibrate them on a "
              "later healthy record: --healthy FILE...")
 
@@ -274,7 +275,7 @@ class _Watch:
                 if self.state is not None:  # a state that cannot be written is noticed at once
                     self._keep()
                 for raw, fresh in signals.until_stopped(parts):
-                    self._take_in(raw, fresh)
+                    self._process_block(raw, fresh)
             except KeyboardInterrupt:
                 pass
             except BrokenPipeError:  # the reader of the events has ended
@@ -291,7 +292,7 @@ class _Watch:
         if self.bad:
             _note(f"{self.bad} of {self.watcher.samples} rows were unreadable in part or in full")
 
-    def _take_in(self, raw: list[bytes], fresh: str) -> None:
+    def _process_block(self, raw: list[bytes], fresh: str) -> None:
         from optid.errors import DataError
 
         self._is_whole = False

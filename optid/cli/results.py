@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from optid.cli.terminal import Waiting, coloured, hearing, note, say
+from optid.cli.terminal import Spinner, capture_warnings, coloured, note, print_text
 from optid.errors import DataError, StructureError
 from optid.registry import CONSTRAINTS, FORMULATIONS, entry_point, render
 
@@ -45,10 +45,10 @@ def reading_for(model: Any, how: Mapping[str, Any]) -> dict[str, Any]:
 
     A model of a record without a clock counts samples: another record of its plant is read as that one was.
     """
-    from optid.cli.arguments import as_modelled
+    from optid.cli.arguments import options_of_model
 
     counts_samples = not model.time_unit and model.dt == 1
-    return as_modelled(how, model) | ({"dt": how["dt"]} if counts_samples else {})
+    return options_of_model(how, model) | ({"dt": how["dt"]} if counts_samples else {})
 
 
 def check_folders(*paths: Path | None, writable: bool = True) -> None:
@@ -75,7 +75,7 @@ def save_model(model: Any, path: Path, record: Mapping[str, Any] | None = None) 
         model.save(path, record)
 
 
-class Work(Waiting):
+class Work(Spinner):
     """The progress of a command, and what it prints at the end, also where an error ends it.
 
     Attributes:
@@ -112,13 +112,13 @@ class Work(Waiting):
     def print(self) -> None:
         """Print the result, the warnings that it does not contain, and the files written."""
         if self.text:
-            say(coloured(self.text))
+            print_text(coloured(self.text))
         said = " ".join(self.text.split())
         for sentence in self.heard:
             if " ".join(sentence.split()) not in said:
                 note(sentence)
         for what, path in self.written.items():
-            say(f"{what} written to {path}")
+            print_text(f"{what} written to {path}")
 
 
 @contextmanager
@@ -127,7 +127,7 @@ def working(*files: Path | None) -> Iterator[Work]:
     check_folders(*files)
     work = Work()
     try:
-        with hearing() as work.heard, work:
+        with capture_warnings() as work.heard, work:
             work.step("reading")
             yield work
     except BaseException:

@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 from optid.cli.listings import systems
 from optid.cli.options import File, Words, register
 from optid.cli.results import check_folders, command_line
-from optid.cli.terminal import STOPPED, Command, SafeConsole, say
+from optid.cli.terminal import STOPPED, Command, SafeConsole, print_text
 
 study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich",
                     help="Compare formulations and solvers on your data: run, report and export a study.")
@@ -64,7 +64,7 @@ def run(file: File = None, example: bool = False, db: File = None, workers: Work
     solved = _summary(db, described.name)
     if export is not None:
         count = exporting.export(db, export, described.name)
-        say(f"{count} rows written to {export}")
+        print_text(f"{count} rows written to {export}")
     if not solved:
         raise typer.Exit(NOTHING_SOLVED)
 
@@ -87,13 +87,13 @@ def report(db: Path, page: File = None, title: str | None = None, accuracy: floa
 
     check_folders(page)
     verdict = conclude(rows_of_one(db, title), accuracy=accuracy, time=clock)
-    say(str(verdict))
+    print_text(str(verdict))
     print_models(verdict)
     print_reasons(verdict.table)
     print_former(db, title)
     if page is not None:
         write_page(verdict, page, command=command_line())
-        say(f"report written to {page}")
+        print_text(f"report written to {page}")
 
 
 def export(db: Path, target: Path, title: str | None = None) -> None:
@@ -111,7 +111,7 @@ def export(db: Path, target: Path, title: str | None = None) -> None:
     rows = rows_of_one(db, title) if title is not None else read_rows(db)
     count = exporting.export(db, target, title)
     studies = len(set(rows["study"]))
-    say(f"{count} rows{f' of {studies} studies' if studies > 1 else ''} written to {target}")
+    print_text(f"{count} rows{f' of {studies} studies' if studies > 1 else ''} written to {target}")
 
 
 def problems(db: Path, out: Path, title: str | None = None) -> None:
@@ -127,7 +127,7 @@ def problems(db: Path, out: Path, title: str | None = None) -> None:
     lines = write_problems(db, out, title)
     kinds = Counter(line["kind"] for line in lines)
     listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "none is convex"
-    say(f"{len(lines)} problems written to {out} ({listed}); solve_problems.py there solves them without optid")
+    print_text(f"{len(lines)} problems written to {out} ({listed}); solve_problems.py there solves them without optid")
 
 
 def schema() -> None:
@@ -149,7 +149,7 @@ def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
     """
     from rich import progress
 
-    from optid.studies.execution.running import told_former
+    from optid.studies.execution.running import describe_previous_run
     from optid.studies.storage.store import Store
 
     console = SafeConsole(stderr=True)
@@ -164,14 +164,14 @@ def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
         counts[:] = done, total
         if row is None and db is not None and done:
             left = f"{total - done:,} to run" if done < total else "nothing is left to run"
-            say(f"{done:,} of {total:,} cells are in {db} already; {left}")
+            print_text(f"{done:,} of {total:,} cells are in {db} already; {left}")
         elif row is None and db is not None:
-            say(f"{total:,} cells to run")
+            print_text(f"{total:,} cells to run")
         if row is None and db is not None and described is not None:
             with Store(db) as store:
-                former = told_former(store, described)
+                former = describe_previous_run(store, described)
             if former:
-                say(former)
+                print_text(former)
         bar.update(task, completed=done, total=total, description=_now(row))
 
     try:
@@ -179,7 +179,7 @@ def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
             yield follow
     except KeyboardInterrupt:
         kept = f"{counts[0]:,} of {counts[1]:,} cells are in {db}; the same command goes on from there"
-        say(f"stopped: {kept}" if db is not None else "stopped")
+        print_text(f"stopped: {kept}" if db is not None else "stopped")
         raise typer.Exit(STOPPED) from None
 
 
@@ -198,12 +198,12 @@ def _plan(described: Any, db: Path, **settings: Any) -> None:
     from optid.studies.execution import running
 
     every, left, former = running.plan(described, db, **settings)
-    say(f"{described.name}: {len(described.data)} data, {len(described.formulations)} formulations, "
-        f"{len(described.solvers)} solvers; {len(every):,} cells, {len(left):,} of them to run")
+    print_text(f"{described.name}: {len(described.data)} data, {len(described.formulations)} formulations, "
+               f"{len(described.solvers)} solvers; {len(every):,} cells, {len(left):,} of them to run")
     for refusal, count in Counter(cell.refusal for cell in every if cell.refusal).items():
-        say(f"{count:,} cells cannot be run here: {refusal}")
+        print_text(f"{count:,} cells cannot be run here: {refusal}")
     if former:
-        say(former)
+        print_text(former)
 
 
 def _summary(db: Path, name: str) -> bool:
@@ -224,9 +224,9 @@ def _summary(db: Path, name: str) -> bool:
     verdict = conclude(rows)
     summary.print_models(verdict)
     headline = verdict.headline
-    say(Text.assemble((f"{headline.word}: ", "bold"), headline.text))
+    print_text(Text.assemble((f"{headline.word}: ", "bold"), headline.text))
     words = ["optid", "study", "report", str(db), "-o", f"{db.stem}.html"]
     words += ["--study", name] if len(rows["key"]) < len(every["key"]) else []
-    say(Text(shlex.join(words), "dim"))
+    print_text(Text(shlex.join(words), "dim"))
     answers = rows["reached"] | np.isin(rows["status_verified"], (str(Status.INFEASIBLE), str(Status.UNBOUNDED)))
     return bool(answers.any())

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.text import Text
 
-from optid.cli.terminal import print_table, say
+from optid.cli.terminal import print_table, print_text
 from optid.studies.storage.rows import DONE, REFUSED
 
 LISTED = 12  # reasons that are printed; the page has them all
@@ -50,9 +50,9 @@ def print_reasons(rows: Mapping[str, Any]) -> None:
     for (word, shape), found in ordered[:LISTED]:
         reasons = {reason for _, reason in found}
         names = listed(sorted({solver for solver, _ in found}), most=20)
-        say(Text(f"{names}: {word} {len(found):,}: {reasons.pop() if len(reasons) == 1 else shape}", "dim"))
+        print_text(Text(f"{names}: {word} {len(found):,}: {reasons.pop() if len(reasons) == 1 else shape}", "dim"))
     if len(ordered) > LISTED:
-        say(Text(f"and {len(ordered) - LISTED} more reasons, listed in the report and the database", "dim"))
+        print_text(Text(f"and {len(ordered) - LISTED} more reasons, listed in the report and the database", "dim"))
 
 
 def print_models(verdict: Any) -> None:
@@ -75,5 +75,5 @@ def print_former(db: Path, study: str | None = None) -> None:
         count = sum(store.superseded(study).values())
     if count:
         rows, stay = ("row", "is") if count == 1 else ("rows", "are")
-        say(Text(f"{count:,} {rows} of former entries, data, settings or versions, or of cells that were run again, "
-                 f"{stay} kept in {db} (table superseded) and in no report", "dim"))
+        print_text(Text(f"{count:,} {rows} of former entries, data, settings or versions, or of cells that were run "
+                        f"again, {stay} kept in {db} (table superseded) and in no report", "dim"))

@@ -42,7 +42,7 @@ class Command(TyperCommand):
         except Exception as error:
             if ctx.find_root().params.get("debug"):
                 raise
-            complain(error)
+            print_error(error)
             raise typer.Exit(exit_code(error)) from None
 
 
@@ -125,7 +125,7 @@ def output() -> Console:
     return SafeConsole(highlight=False)
 
 
-def say(text: str | Text) -> None:
+def print_text(text: str | Text) -> None:
     """Print a result as it is: no wrapping, no markup."""
     output().print(Text(text) if isinstance(text, str) else text, soft_wrap=True)
 
@@ -159,7 +159,7 @@ def coloured(text: str) -> Text:
     return result
 
 
-def complain(error: BaseException) -> None:
+def print_error(error: BaseException) -> None:
     """Print one message for an error, on the error stream."""
     text = str(error) or type(error).__name__
     if isinstance(error, OptidError):
@@ -184,7 +184,7 @@ def _tell(word: str, style: str, text: str) -> None:
 
 
 @contextmanager
-def hearing() -> Iterator[list[str]]:
+def capture_warnings() -> Iterator[list[str]]:
     """Collect the data warnings of a block, each sentence once; print them if an error ends the block."""
     heard: list[str] = []
 
@@ -204,7 +204,7 @@ def hearing() -> Iterator[list[str]]:
             raise
 
 
-class Waiting:
+class Spinner:
     """Progress on the error stream after `PATIENCE` seconds; nothing where that is no terminal."""
 
     def __init__(self) -> None:

@@ -1,6 +1,6 @@
 """Quantities that unknowns determine, and that terms and constraints speak about besides the unknowns themselves.
 
-Every leaf is a CVXPY variable of its own in the words of the user, so that a constraint about ``Theta = mu bᵀ`` is
+Every leaf is its own CVXPY variable in the words of the user, so that a constraint about ``Theta = mu bᵀ`` is
 affine; its values and slopes in the unknowns follow by the chain rule.
 """
 

@@ -41,7 +41,7 @@ def price_constraints(problem: Problem, x: Values, duals: Mapping[str, Array], o
         found.append(Price(
             name, active, sum(gap.size for gap in gaps),
             max(min(float(np.min(gap, initial=np.inf)) for gap in gaps), 0.0), problem.unit * slope,
-            problem.unit * slope * worth, steps[chosen], limits[chosen].words or "the size of what it bounds"))
+            problem.unit * slope * worth, steps[chosen], limits[chosen].words or "the size of the bounded quantity"))
     return tuple(found)
 
 

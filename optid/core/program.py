@@ -59,7 +59,7 @@ class CvxpyStatement:
         variables, derived, parts = dict(unknowns), {}, []
         for term in problem.terms:
             expression = term.express(leaves)
-            if isinstance(term, LowRank):  # its multipliers, those of a matrix of its own, tell a bound
+            if isinstance(term, LowRank):  # its multipliers, those of its own matrix, tell a bound
                 derived["X"], variables["X"] = expression, cp.Variable(expression.shape, name="X")
                 constraints["structure"] = (variables["X"] == expression,)
                 expression = cp.normNuc(variables["X"])

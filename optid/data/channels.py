@@ -168,7 +168,7 @@ def channel_fields(
     everything = found["inputs"] + found["outputs"]
     for name, count in Counter(everything).items():
         if count > 1:
-            raise DataError(f"two channels are named {name!r}; give every channel a name of its own.")
+            raise DataError(f"two channels are named {name!r}; give every channel its own name.")
     return found
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from optid.data.channels import MOST_LEVELS, Channel
+from optid.phrases import plural
 
 MOST_EXPERIMENTS = 10  # that are listed
 MOST_FINDINGS = 6  # that stand before a verdict
@@ -34,12 +35,12 @@ class Description:
     findings: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        lines = [f"{self.name or 'Record'}: {sum(self.lengths)} samples every {self.interval}"]
+        lines = [f"{self.name or 'Record'}: {plural(sum(self.lengths), 'sample', '')} every {self.interval}"]
         found = [f"  {finding}" for finding in self.findings]
         if len(self.lengths) > MOST_EXPERIMENTS:
             lines.append(f"  {len(self.lengths)} experiments of {min(self.lengths)} to {max(self.lengths)} samples")
         for k, (samples, ends) in enumerate(zip(self.lengths, self.ends) if len(lines) < 2 else ()):
-            label = f"experiment {k + 1}: {samples} samples " if len(self.lengths) > 1 else ""
+            label = f"experiment {k + 1}: {plural(samples, 'sample', '')} " if len(self.lengths) > 1 else ""
             lines.append(f"  {label}from {instant(ends[0])} to {instant(ends[1])}")
         lines[1:1] = found
         table = [("channel", "role", "unit", "low", "high", "mean", "std", "levels", "missing")]

@@ -232,6 +232,6 @@ def _groups(values: np.ndarray | None, rows: int, label: str) -> list[tuple[Any,
     for k, value in enumerate(labels):
         if value in seen:
             raise DataError(f"{label}: experiment {value!r} starts again at row {starts[k] + 1}. Sort the rows by "
-                            "experiment, or give the second run a value of its own.")
+                            "experiment, or give the second run its own value.")
         seen.add(value)
     return [(value, slice(a, b)) for value, a, b in zip(labels, starts, [*starts[1:], rows])]

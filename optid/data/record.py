@@ -14,6 +14,7 @@ from optid.data.channels import Channel, Ports, Transform, channel_fields, inter
 from optid.data.description import Description, instant
 from optid.data.timeline import Timeline, read_times, seconds_of, starts_of
 from optid.errors import DataError, nearest
+from optid.phrases import plural
 from optid.registry import render
 
 
@@ -229,7 +230,7 @@ class Data(Ports):
     def __repr__(self) -> str:
         runs = f"{self.n_experiments} experiments, " if self.n_experiments > 1 else ""
         channels = f"{', '.join(self.inputs)} -> {', '.join(self.outputs)}"
-        return f"Data({self.name!r}: {runs}{self.n_samples} samples every {self.interval}, {channels})"
+        return f"Data({self.name!r}: {runs}{plural(self.n_samples, 'sample', '')} every {self.interval}, {channels})"
 
     @property
     def interval(self) -> str:
@@ -245,6 +246,9 @@ class Data(Ports):
         ends = [line.instants([0, e.n_samples - 1]) for line, e in zip(self.timelines, self.experiments)]
         return Description(self.name, self.interval, tuple(e.n_samples for e in self.experiments),
                            tuple((a, b) for a, b in ends), self.channels, self.findings)
+
+    def _repr_html_(self) -> str:
+        return render(self, "html")
 
     def plot(self) -> Any:
         """Return a matplotlib figure of every channel over time."""

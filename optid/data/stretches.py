@@ -57,6 +57,6 @@ def with_whole_inputs(data: Data, shortest: int) -> Data:
     short = f"; {dropped} shorter than {shortest} outputs {'is' if dropped == 1 else 'are'} left out" if dropped else ""
     warnings.warn(
         f"missing inputs: {channels}. The record is cut there: {cut.n_samples} of {data.n_samples} samples remain in "
-        f"{cut.n_experiments} stretch{'es' if cut.n_experiments > 1 else ''}, each with an initial state of its own"
+        f"{cut.n_experiments} stretch{'es' if cut.n_experiments > 1 else ''}, each with its own initial state"
         f"{short}. Interpolated inputs would lose less where gaps are short", DataWarning, stacklevel=5)
     return cut

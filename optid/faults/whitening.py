@@ -14,6 +14,7 @@ from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
 from optid.models.recursions import SHORT, propagated
 from optid.models.roots import spectral_radius
+from optid.phrases import p_value
 
 if TYPE_CHECKING:
     from optid.faults.nuisance import ModelUncertainty, Nuisance
@@ -128,7 +129,7 @@ def predictor(model: "HammersteinSS") -> Predictor:
         DataWarning: a noise without power at some frequency.
     """
     if model.levels is not None:
-        raise StructureError("Every record of this model has a level of its own, which a fault of a sensor would pass "
+        raise StructureError("Every record of this model has its own level, which a fault of a sensor would pass "
                              "for: choose the level of the plant by model.at_level(constant).")
     if model.noise is None:
         raise StructureError(
@@ -290,7 +291,8 @@ class Health:
         """State the p-value and the sizes."""
         sizes = ", ".join(f"{name} {ratio:.3f}" for name, ratio in self.ratios.items())
         return (
-            f"innovations over {self.samples} samples: p-value of whiteness {self.p_value:.3g} ({self.lags} lags)\n"
+            f"innovations over {self.samples} samples: p-value of whiteness {p_value(self.p_value, 3)} "
+            f"({self.lags} lags)\n"
             f"size over the predicted one: {sizes}; largest {self.ratio:.3f}"
         )
 
@@ -309,8 +311,8 @@ class Health:
         """
         if not self.white:
             raise DataError(
-                f"The innovations of the healthy record are not white (p-value {self.p_value:.2g}): thresholds from "
-                "this model would be wrong. Fit the model again, calibrate the thresholds on healthy records "
+                f"The innovations of the healthy record are not white (p-value {p_value(self.p_value)}): thresholds "
+                "from this model would be wrong. Fit the model again, calibrate the thresholds on healthy records "
                 "(empirical_thresholds), or include the uncertainty of the identified model (model_uncertainty)."
             )
         if rescale:

@@ -215,11 +215,11 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
     for more in (1, 2):
         if "na" in arguments and "nb" in arguments:
             na, nb = arguments["na"] + more, _more(arguments["nb"], more)
-            yield f"na {na} and nb {_words(nb)}", f"--na {na} --nb {_words(nb)}", {"na": na, "nb": nb}
+            yield f"a higher order (na {na}, nb {_words(nb)})", f"--na {na} --nb {_words(nb)}", {"na": na, "nb": nb}
     for more in (1, 2):
         if isinstance(arguments.get("nx"), int):
             nx = arguments["nx"] + more
-            yield f"nx {nx}", f"--nx {nx}", {"nx": nx}
+            yield f"a higher order (nx {nx})", f"--nx {nx}", {"nx": nx}
     if arguments.get("offset") is False:
         yield "an estimated constant", "--set offset=true", {"offset": True}
     static = "hammerstein" in name

@@ -33,10 +33,11 @@ from optid.identify.dynamics import dynamics, input_levels
 from optid.identify.parameters import Parameters, criteria, parameters, uncertainty_or_reason
 from optid.identify.record_checks import examine, examine_figures
 from optid.models.functions import has_feedback
+from optid.phrases import plural
 from optid.program.prices import Price
 from optid.program.solution import Bound, Solution, Status
 from optid.progress import log
-from optid.registry import Rendered, annotations, check_arguments, defaults, formulation, named_constraint
+from optid.registry import Rendered, annotations, check_arguments, defaults, formulation, read_constraints
 from optid.solving.solve import Outcome, Procedure, run
 from optid.solving.steps import Solvers, choose_solvers
 from optid.threads import one_thread
@@ -217,6 +218,23 @@ class Fit(Rendered):
         record = self.data.raw() if isinstance(self.data, Data) else None
         return dynamics(self.model, input_levels(self.model, record), *uncertainty_or_reason(self))
 
+    @property
+    def poles(self) -> np.ndarray:
+        """Poles of the model, complex, in the plane of z, the largest first (of a physical model: at its `point`)."""
+        return self._fitted.poles
+
+    @property
+    def equation(self) -> str:
+        """The equations of the model in raw units as text, one a line."""
+        return self._fitted.equation()
+
+    @property
+    def _fitted(self) -> Any:
+        """The model; a fit without one is refused."""
+        if self.model is None:
+            raise SolverFailed(f"the fit has no model: its status is {self.solution.status}")
+        return self.model
+
     def conf_int(self, level: float = 0.95) -> Parameters:
         """Return the parameters with intervals of this level."""
         return parameters(self, level)
@@ -276,6 +294,23 @@ class Fit(Rendered):
         """Save the model as JSON; `optid.load` reads it."""
         self.model.save(path)
 
+    def __repr__(self) -> str:
+        """Say structure, verdict, fit and status, as far as they have been computed: nothing is computed for it."""
+        known = vars(self)
+        shown = [f"{key}={list(value) if isinstance(value, tuple) else value}"
+                 for key, value in self.arguments.items() if _is_short(value)]
+        rules = len(self.arguments.get("constraints", ()))
+        parts = [" ".join([self.formulation, *shown, *([plural(rules, "constraint")] if rules else [])])]
+        judged = known.get("verdict")
+        if judged is not None:
+            parts.append(f"verdict {judged.word}, fit {judged.score:.1f} %")
+        else:
+            parts.append("verdict not computed")
+            parts += [f"{name.replace('_fit', '').replace('_', '-')} fit {np.min(known[name]):.1f} %"
+                      for name in ("one_step_fit", "simulation_fit") if name in known]
+        solution = known.get("solution") or (self.outcome.solution if "outcome" in known else None)
+        return f"Fit({', '.join([*parts, *([str(solution.status)] if solution is not None else [])])})"
+
     def _record(self) -> Data:
         if not isinstance(self.data, Data):
             raise DataError("the fit is of a stream, whose samples are not kept: pass a record")
@@ -302,6 +337,12 @@ class Fit(Rendered):
                                  settings.pop("solver", "auto"))
         vars(self)["outcome"] = run(pose(self.data, **self.arguments), solvers, **settings)
         return self.outcome
+
+
+def _is_short(value: Any) -> bool:
+    """Whether an argument is a number, a word, or a short list of numbers."""
+    numbers = isinstance(value, list | tuple) and len(value) <= 4 and all(isinstance(one, int | float) for one in value)
+    return isinstance(value, int | float) or numbers or (isinstance(value, str) and len(value) <= 40)
 
 
 @dataclass(frozen=True)
@@ -339,7 +380,7 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
         isolate: run the solver in a separate process, so that a crash is an outcome.
         prove: ask for a proof of global optimality.
         constraints: builders (``formulations.constraints.shape``), callables of the named variables, or words such as
-            "monotone:increasing", in the units of ``data``.
+            "monotone:increasing", in the units of ``data``; one of them alone needs no list.
         solver_options: native options of the solver.
         raises: False returns failures as values (``fit.solution.status``) instead of raising.
         structure: arguments of the formulation (na, nb, nk, basis, loss, gauge, ...).
@@ -355,7 +396,7 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
         raise DataError(not_a_record(data, "fit"))
     name, pose = formulation(formulation_name)
     arguments = dict(structure)
-    built = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)
+    built = read_constraints(constraints)
     if built:
         arguments["constraints"] = built
     check_arguments(name, pose, arguments)

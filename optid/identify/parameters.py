@@ -69,10 +69,16 @@ class Parameters(Rendered, Sequence):
         """Estimates (n,)."""
         return np.array([row.estimate for row in self.rows])
 
-    def to_frame(self) -> Any:
-        """Return a pandas data frame, one row per parameter."""
-        import pandas
+    def to_pandas(self) -> Any:
+        """Return a pandas frame, one row a parameter, with the columns estimate, error, lower, upper and unit.
 
+        Raises:
+            DataError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise DataError('to_pandas needs pandas: pip install "optid[tables]"') from None
         return pandas.DataFrame(self.rows, columns=Parameter._fields).set_index("name")
 
 

@@ -14,6 +14,7 @@ from optid.errors import DataError, DataWarning
 from optid.identify.design.rules import Check, check_condition, check_instruments, check_levels, check_lines
 from optid.identify.informativity.excitation import check_numbers
 from optid.identify.outliers import find_outliers
+from optid.phrases import plural
 
 LEAST_KEPT = 0.5
 FEW_DIGITS = 8.0  # beside the level of an output
@@ -147,4 +148,4 @@ def _outliers(role: str, name: str, records: Sequence[np.ndarray], arguments: Ma
         advice += ", or use loss='huber', which leaves out every row that contains one"
     else:
         advice = f"check the record and {advice}"
-    return [f"{count} outlier{'s' * (count > 1)} in {role} {name!r} ({list_samples(found)}): {advice}"]
+    return [f"{plural(count, 'outlier')} in {role} {name!r} ({list_samples(found)}): {advice}"]

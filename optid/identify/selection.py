@@ -67,7 +67,7 @@ def path(data: Data, formulation: str, *, penalty: str, weights: Sequence[float]
     if penalty not in PENALTIES:
         raise StructureError(f"penalty is one of {', '.join(PENALTIES)}; got {penalty!r}")
     if not 0 <= holdout < 1:
-        raise StructureError(f"holdout is a share from 0 to below 1; got {holdout!r}")
+        raise StructureError(f"holdout must be a share from 0 to below 1; got {holdout!r}")
     train, test = data.split(1 - holdout) if holdout else (data, None)
     grid = default_weights(train) if weights is None else np.sort(np.asarray(weights, dtype=float))
     fits, scores = [], []

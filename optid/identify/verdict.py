@@ -22,6 +22,7 @@ from optid.identify.validation.checks import NOT_TESTED, record_structure, share
 from optid.identify.validation.predictions import fit_percent, one_step_or_nan, simulated_or_nan
 from optid.identify.validation.systematic import systematic
 from optid.models.functions import has_feedback, step_length
+from optid.phrases import p_equals
 from optid.threads import one_thread
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
@@ -164,7 +165,7 @@ def _response(model: Any, data: Data, runs: Sequence[Array], told: Informativity
         return [Finding("error that the inputs explain", f"{UNKNOWN}: too few samples", True, counts=False)]
     where = f" ({found.output})" if data.l > 1 else ""
     size = f"{100 * found.share:.2g} % of the response{where}" if found.found else f"none visible{where}"
-    return [Finding("error that the inputs explain", f"{size} (p = {found.p_value:.2g})",
+    return [Finding("error that the inputs explain", f"{size} ({p_equals(found.p_value)})",
                     not (found.found and found.share > NOTED), found.found and found.share > WRONG)]
 
 
@@ -279,7 +280,7 @@ def _structure(model: Any, data: Data) -> list[Finding]:
         return [Finding("structure", f"{UNKNOWN}: {why[0]}", True, counts=False)] if why else []
     saved = "" if found.passed else f", which saves {100 * found.saving:.2g} % of the residual variance"
     word = "not rejected" if found.passed else found.finding
-    return [Finding("structure", f"{word}{saved} (p = {found.p_value:.2g})", found.passed,
+    return [Finding("structure", f"{word}{saved} ({p_equals(found.p_value)})", found.passed,
                     found.saving > STRUCTURE)]
 
 

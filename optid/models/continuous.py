@@ -248,7 +248,7 @@ class ContinuousModel(Ports):
     def to_control(self, pade: int | None = None) -> Any:
         """Return the linear part as a python-control system, with the names of `Model.to_control`.
 
-        python-control has no continuous dead time: with one, `pade` is needed; see `with_pade`.
+        python-control has no continuous dead time: one requires `pade`; see `with_pade`.
 
         Raises:
             StructureError: a dead time without `pade`, or an impossible order.

@@ -34,7 +34,7 @@ class HammersteinTF(Model):
     """``y = x + (C/D) e`` with ``A x = sum_c B_c f_c(u_c) + offset``, in raw units.
 
     The plant is ``x(k) + sum_i A_i x(k-i) = sum_c sum_j b_c[j] f_c(u_c(k - nk_c - j)) + offset``. By default D is A and
-    C is 1: an ARX model, with one or several outputs. With C it is ARMAX, with a D of its own Box-Jenkins, with D = 1
+    C is 1: an ARX model, with one or several outputs. With C it is ARMAX, with its own D Box-Jenkins, with D = 1
     and no C output error. With the basis `Linear` the model is a linear one.
 
     Attributes:
@@ -402,7 +402,7 @@ class HammersteinTF(Model):
             StructureError: a model with `levels`, of which so few samples do not tell the one of their record.
         """
         if self.levels is not None:
-            raise StructureError("Every record of this model has a constant of its own, which so few samples do not "
+            raise StructureError("Every record of this model has its own constant, which so few samples do not "
                                  "tell: choose one by at_level, or use initial_state.")
         u, y, n = samples_of(u, "u", self.m), samples_of(y, "y", self.l), self.largest_lag
         if len(u) < n or len(u) != len(y):

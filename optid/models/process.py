@@ -335,7 +335,7 @@ class ProcessModel(Model):
     to_dlti, to_casadi, to_c, to_st, to_fmu = map(_of_samples, ("to_dlti", "to_casadi", "to_c", "to_st", "to_fmu"))
 
     def to_control(self, pade: int | None = None) -> Any:
-        """Return the continuous transfer as a python-control system; with a dead time `pade` is needed."""
+        """Return the continuous transfer as a python-control system; a dead time requires `pade`."""
         return self.to_continuous().to_control(pade)
 
     # -- gauge, units, files -------------------------------------------------------------------------------------------

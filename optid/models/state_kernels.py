@@ -165,7 +165,7 @@ def sensitivities(parts, direct, signals, turn, jacobian):
     With H(k) = dh(z)/dtheta = h' Cz S + (what theta changes in h(z) directly), and
     J(k) = dy/dtheta = C S + Fz H + (what theta changes in y directly),
 
-        S(k+1) = A S + Ez H + (what theta changes in x(k+1) directly) + R J   where R is what comes back of the output.
+        S(k+1) = A S + Ez H + (what theta changes in x(k+1) directly) + R J   where R is the output-feedback gain.
 
     The direct changes are a `Direct`; the initial state has the first n columns. Written are ``turn`` S (n, q) and the
     ``jacobian`` J, the first q columns of (T, l, q or more).

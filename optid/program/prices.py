@@ -13,7 +13,8 @@ class Price:
 
     Multiplier and price are derivatives by the bound that the user wrote: the number in the constraint, in its units.
     Rows that share a bound move together; of several bounds the most expensive one counts. For conditions without a
-    number (monotone, odd, ...) the bound is the zero in their rows: how far, in units of f, each of them may be missed.
+    number (monotone, odd, ...) the bound is the zero in their rows: the tolerance, in units of f, by which each row
+    may be violated.
     """
 
     name: str  # the user's name
@@ -25,7 +26,7 @@ class Price:
     # belongs to a step with another objective
     fit_points: float
     step: float = float("nan")  # what 1 % is in units of the bound
-    words: str = ""  # of what: of the range of f where the bound is about f, else of the size of what it bounds
+    words: str = ""  # of what: of the range of f where the bound is about f, else of the size of the bounded quantity
 
     @property
     def binding(self) -> bool:

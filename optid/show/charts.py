@@ -15,6 +15,7 @@ from optid.identify.validation import validate
 from optid.identify.validation.correlations import Correlation
 from optid.identify.validation.predictions import one_step_or_nan, simulated
 from optid.models.functions import StaticFunction, response_pairs, runs_free, static_functions
+from optid.phrases import p_equals
 from optid.show import summary
 from optid.show.estimates import uncertainty
 from optid.show.sections import Axis, Chart, Series, decibels
@@ -268,7 +269,7 @@ def correlation_chart(test: Correlation) -> Chart:
     what = f"Whiteness of the residuals of {test.output}" if own else (
         f"Independence of the residuals of {test.output} from {test.input}")
     outcome = "not tested" if np.isnan(test.p_value) else (
-        f"{'PASS' if test.passed else 'FAIL'} (p = {test.p_value:.2g})")
+        f"{'PASS' if test.passed else 'FAIL'} ({p_equals(test.p_value)})")
     reach = 1.15 * float(np.nanmax(np.abs(np.append(values, 1.3 * band)), initial=1e-3))
     series = [Series("99 % band", lags, band, "area", "muted", -band),
               Series("inside", lags[~outside], values[~outside], "stems")]

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.models.functions import static_functions
+from optid.phrases import p_value
 from optid.show.wording import Table, number, percent, seconds
 
 if TYPE_CHECKING:
@@ -37,12 +38,12 @@ def _test_table(checked: "Validation") -> Table:
     rows = []
     for t in checked.tests:
         outside = f"{t.outside} of {t.lags.size - (t.input is None)}"
-        found = (t.outcome, number(t.p_value, 2), outside) if np.isfinite(t.p_value) else (t.outcome, "-", "-")
+        found = (t.outcome, p_value(t.p_value), outside) if np.isfinite(t.p_value) else (t.outcome, "-", "-")
         rows.append((f"{t.output}: {_verdict(t)}", *found))
     structure, note = checked.structure, ""
     if structure is not None:
         outcome = "PASS" if structure.passed else "FAIL"
-        rows.append((f"structure: {structure.finding}", outcome, number(structure.p_value, 2), "-"))
+        rows.append((f"structure: {structure.finding}", outcome, p_value(structure.p_value), "-"))
         ratios = ", ".join(f"{name} {ratio:.3g}" for name, ratio in structure.ratios.items())
         saved = 100 * max(structure.saving, 0)
         note = f"A less restrictive structure would reduce the residual variance by {saved:.2g} %; second over first "

@@ -15,6 +15,7 @@ from optid.identify.responses import Response
 from optid.identify.validation import Validation
 from optid.identify.validation.predictions import SIMULATION, prediction_fit
 from optid.identify.verdict import POOR_FIT, USELESS_FIT
+from optid.phrases import plural
 from optid.show import charts, checks, estimates, responses, summary, wording
 from optid.show.record import informativity_table
 from optid.show.sections import (
@@ -139,7 +140,7 @@ def record_document(data: Data, *, command: str = "") -> Document:
 
 
 def _length(data: Any) -> str:
-    return f"{data.n_samples} samples" if data.n_samples else ""
+    return plural(data.n_samples, "sample", "") if data.n_samples else ""
 
 
 def _trust(fit: "Fit", judged: "Verdict | None", test: Data | None, advise: bool) -> list[Any]:

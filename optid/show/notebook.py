@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup, escape
 
 from optid.data.description import RECORD, first_findings
+from optid.phrases import plural
 from optid.show import documents, estimates, summary
 from optid.show.checks import comparison_table, search_table, validation_tables
 from optid.show.printing import describe
@@ -13,6 +14,7 @@ from optid.show.sections import TONES, Banner, Notes, attempt
 from optid.show.wording import Table, percent
 
 if TYPE_CHECKING:
+    from optid.data.record import Data
     from optid.identify.fitting import Fit
     from optid.identify.parameters import Parameters
     from optid.identify.search import Identification
@@ -38,6 +40,18 @@ def fit_html(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = Tr
         *attempt("The equation", lambda: [("pre", fit.model.equation())]),
         *attempt("The table of the dynamics", lambda: [estimates.parameters_table(fit.dynamics)]),
         *attempt("The table of the parameters", lambda: [estimates.parameters_table(fit.params)])])
+
+
+def data_html(data: "Data") -> str:
+    """Show the name, length and sampling of a record, its findings and its channels."""
+    runs = f", {data.n_experiments} experiments" * (data.n_experiments > 1)
+    title = f"{data.name or 'Record'}: {plural(data.n_samples, 'sample', '')} every {data.interval}{runs}"
+    return _html(title, [*_record(data.findings), summary.channel_table(data)])
+
+
+def verdict_html(judged: "Verdict") -> str:
+    """Show the verdict on a model and every test behind it."""
+    return _html("", [*_verdict(judged), summary.verdict_table(judged)])
 
 
 def _verdict(judged: "Verdict | None") -> list[Banner]:

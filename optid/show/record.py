@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from optid.phrases import p_equals
 from optid.show.terminal import set_table, wrapped
 from optid.show.wording import Table, number
 
@@ -21,7 +22,7 @@ def informativity_table(told: "Informativity") -> Table:
             lag = f"{response.nk}" if low == high else f"{response.nk} ({low} to {high})"
             inside = response.poles[(response.poles != 0) & (response.poles != 1)]
             taus = sorted((-1 / np.log(np.abs(inside))).tolist(), reverse=True)
-            seen = f"{'visible' if effect.visible else 'none'} (p = {effect.p_value:.1g})" if effect else "-"
+            seen = f"{'visible' if effect.visible else 'none'} ({p_equals(effect.p_value, 1)})" if effect else "-"
             words = ["integrates"] * response.integrates + [number(tau, 3) for tau in taus]
             rows.append((f"{name} to {process.output}", told.loops[c].word, seen, lag,
                          "-" if response.integrates else number(response.gain, 4), ", ".join(words) or "-"))

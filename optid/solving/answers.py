@@ -1,4 +1,4 @@
-"""Run a back end, here or in a process of its own: whatever happens, an answer comes back."""
+"""Run a back end, here or in its own process: whatever happens, an answer comes back."""
 
 import time
 from collections.abc import Mapping
@@ -39,7 +39,7 @@ def answer_of(program: Program, back_end: BackEnd, settings: Settings, separate:
 
 
 def _run(back_end: BackEnd, program: Program, settings: Settings) -> Answer:
-    """Run a back end; an exception of its own is an answer, too, also in a child."""
+    """Run a back end; its own exception is an answer, too, also in a child."""
     try:
         return _wellformed(back_end.run(program, settings), program)
     except Unsendable:

@@ -118,8 +118,8 @@ class Evidence:
     # "order"): numbers, texts, and one-dimensional arrays such as "singular values", largest first, which the report
     # draws. The fit prints them in this order
     figures: Mapping[str, Any] = field(default_factory=dict)
-    # returns the model completed by what only some uses need, such as a noise model, and further figures; it is called
-    # when the model of the fit is first used
+    # called on first access to `Fit.model`: adds the parts that are expensive and rarely needed, such as a noise model,
+    # and further figures
     extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
     # of the variables of the last programme at the model, where the model is not that of its solution
     values: Mapping[str, Any] | None = None

@@ -1,4 +1,4 @@
-"""Statistics of a regression whose equation has a constant of its own in every experiment."""
+"""Statistics of a regression whose equation has its own constant in every experiment."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -222,7 +222,7 @@ class StateUnknowns(Unknowns):
 
     @cached_property
     def _columns(self) -> StatePoint:
-        """The number of every unknown behind the columns of the initial state, at its place; below zero: known."""
+        """Index of each unknown among the columns after the initial states; negative if its value is fixed."""
         numbers = self._known()
         for value in vars(numbers).values():
             for array in value if isinstance(value, tuple) else (value,):
@@ -236,7 +236,7 @@ class StateUnknowns(Unknowns):
 
     @cached_property
     def _direct(self) -> Direct:
-        """What `direct` returns, with the numbers of the gains [1, d, b, e] of a point in place of them."""
+        """As `direct`, with the index of each gain in [1, d, b, e] in place of its value at a point."""
         at, signals = self._columns, self.signals
         states, outputs, latent = (np.arange(count)[:, None] for count in (self.n, self.l, len(self.latent)))
         mu, nu, c = (np.concatenate([np.zeros(0), *of]) for of in (at.mus, at.nus, at.cs))

@@ -83,7 +83,7 @@ class TransferUnknowns(Unknowns):
     nc: int = 0  # order of C
     # order of D; None where D is A (ARX, ARMAX). Then there are no initial states among the unknowns
     nd: int | None = 0
-    # whether every experiment has a constant of its own, in place of the offset: a state that does not change
+    # whether every experiment has its own constant, in place of the offset: a state that does not change
     levels: bool = False
 
     @property

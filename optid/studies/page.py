@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from optid import __version__
+from optid.phrases import plural
 from optid.show.page import embedded, scripts, template, versions
 from optid.show.wording import Table, number, seconds, short
 from optid.studies.payload import page_payload
@@ -17,7 +18,7 @@ from optid.studies.verdicts.choice import CANNOT_TELL
 from optid.studies.verdicts.model_advice import model_evidence
 from optid.studies.verdicts.outcomes import MEANINGS, SOLVED, TIMES, states_of_rows
 from optid.studies.verdicts.quality import FIGURES, DataSet, Quality
-from optid.studies.verdicts.statement import FAIR, GOOD, counting, plural
+from optid.studies.verdicts.statement import FAIR, GOOD, counting
 from optid.studies.verdicts.verdict import StudyVerdict, conclude
 
 SCRIPTS = ("plot.js", "grid.js", "study.js")

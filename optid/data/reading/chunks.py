@@ -81,8 +81,8 @@ class Channels:
             raise DataError(
                 f"{first.label} begins {step:.6g} after the last sample of {last.label}, the sampling time is "
                 f"{self.step:.6g}. Parts must follow one another: sort them by time (files are taken in the order of "
-                "their names), give what is behind a gap as an experiment of its own (a list of sources), or pass "
-                "time=False and dt=.")
+                "their names), pass the part after a gap as a separate experiment (a list of sources), or "
+                "pass time=False and dt=.")
 
 
 def _gathered(block: Block, pairs: Mapping[str, str], label: str, done: int, how: Format) -> np.ndarray:

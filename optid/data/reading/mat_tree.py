@@ -69,7 +69,7 @@ def open_tree(path: Path) -> Iterator[dict[str, Node]]:
     from scipy.io.matlab import matfile_version
 
     with open(path, "rb") as file:
-        by_matlab = file.read(len(HDF5)) != HDF5  # which puts a header of its own first
+        by_matlab = file.read(len(HDF5)) != HDF5  # which puts its own header first
     if by_matlab and matfile_version(path)[0] < 2:
         yield _tree_of_scipy(path)
         return
@@ -156,7 +156,7 @@ def _tree_of_scipy(path: Path) -> dict[str, Node]:
         tree = {name: _node_of_scipy(value, stored[name], 1, limit) for name, value in content.items()
                 if not name.startswith("__") and not isinstance(value, matlab.MatlabOpaque)}
         if any(isinstance(value, matlab.MatlabOpaque) for value in content.values()):
-            with open(path, "rb") as file:  # scipy calls all of them 'None': read each from a file of its own
+            with open(path, "rb") as file:  # scipy calls all of them 'None': read each from its own file
                 for name, part in matlab.varmats_from_mat(file):
                     if name == "None":
                         value = loadmat(part)[name]

@@ -31,7 +31,7 @@ def plant_tables(path: Path, kind: str) -> list[PlantTable]:
     """Return the tables of a file.
 
     An Excel file has one table for each sheet; a TDMS file one for each group; an MDF file one for each group of
-    channels with a clock of its own.
+    channels with their own clock.
 
     Raises:
         DataError: the library is missing (with its pip line), or the file is damaged.

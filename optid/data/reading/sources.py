@@ -234,7 +234,7 @@ def open_source(source: Any, chunk: int, how: Format) -> Source:
         return _of_npy(source, chunk, how)
     if not isinstance(source, str | Path):
         raise DataError(f"a stream is opened from a path or a Dask collection, not from {type(source).__name__}; "
-                        "use read for what is in memory.")
+                        "use read for data in memory.")
     if Path(source).is_dir():
         return _of_folder(Path(source), chunk, how)
     path = existing(Path(source)).absolute()
@@ -267,7 +267,7 @@ def _of_npy(paths: Mapping[Any, Any], chunk: int, how: Format) -> Source:
     for name, path in paths.items():
         if not isinstance(path, str | Path):
             raise DataError(f"channel {str(name)!r} is of type {type(path).__name__}: a stream takes paths of npy "
-                            "files for all channels, or Dask arrays for all; use read for what is in memory.")
+                            "files for all channels, or Dask arrays for all; use read for data in memory.")
     files = {str(name): open_npy(existing(Path(path).absolute())) for name, path in paths.items()}
     for name, file in files.items():
         if len(file.names) != 1:

@@ -17,7 +17,7 @@ BURSTS = 1, 3, 10, 30
 """Lengths, in samples, of the bursts searched for."""
 
 
-def left_over(whitened: Whitened, rest: Array, magnitudes: int, further: float = 1.0) -> Remaining:
+def remainder_test(whitened: Whitened, rest: Array, magnitudes: int, further: float = 1.0) -> Remaining:
     """Return the tests of the residual of a window.
 
     Args:

@@ -18,6 +18,7 @@ from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.consistency.waveforms import LONGEST, RANK, by_place, start_matrix, waveform_matrix
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
+from optid.phrases import p_value
 
 NATS = 3.0
 """Places whose log-likelihood is at most this much below the best are in the set."""
@@ -168,7 +169,8 @@ class NoiseTest:
 
     def __str__(self) -> str:
         """Print the places."""
-        lines = [f"more noise from sample {self.onset} on: p-value {self.p_value:.3g} ({self.draws} simulated windows)",
+        lines = [f"more noise from sample {self.onset} on: p-value {p_value(self.p_value, 3)} "
+                 f"({self.draws} simulated windows)",
                  f"  {'place':<36}{'std added':>11}{'scale':>8}{'nats':>9}"]
         for change in self.changes:
             scale = "" if np.isnan(change.scale) else f"{change.scale:.2f}"
@@ -181,7 +183,7 @@ def noise_search(found: Dictionary, whitened: Whitened, *, onset: int = 0, free_
     """Prepare the test for windows like one: its length, missing readings and uncertain model.
 
     Args:
-        found: the candidates: those of kind "noise", or, where there are none, every place of the others.
+        found: the noise candidates; if there are none, one for each place in the dictionary.
         whitened: the window; one experiment.
         onset: sample from which the noise has increased.
         free_start: whether the initial state of the window is unknown (as when it was fitted to the window).

@@ -19,6 +19,7 @@ from optid.faults.readings import LostReadings
 from optid.faults.screening import flat_lines
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
+from optid.phrases import p_value
 
 RANK = 1e-10
 """Singular values below this share of the largest count as zero."""
@@ -92,7 +93,7 @@ class WaveformTest:
         lines = [f"a fault of any course from sample {self.onset} on; set with probability {self.probability:g}",
                  f"  {'place':<34}{'energy left':>12}{'limit':>9}{'p-value':>10}"]
         for place in (*self.places, self.healthy):
-            numbers = f"{place.energy:>12.1f}{place.limit:>9.1f}{place.p_value:>10.2g}"
+            numbers = f"{place.energy:>12.1f}{place.limit:>9.1f}{p_value(place.p_value):>10}"
             lines.append(f"  {place.name[:33]:<34}{numbers}  {'in the set' if place.consistent else 'ruled out'}"[:80])
         lines += [f"  not tested: {label[:24]}, {why}"[:80] for label, why in self.untested.items()]
         return "\n".join([*lines, *map(str, self.flat)])

@@ -37,7 +37,7 @@ EXACT = 1e-12
 """Variance of a share lost that is known."""
 
 
-def extended(found: Dictionary) -> Dictionary | None:
+def with_unlisted_candidates(found: Dictionary) -> Dictionary | None:
     """Return the candidates beside those of a dictionary; None for none.
 
     They are actuators with a loss without a stated zero and without a stuck candidate, and, where "none of these" is a
@@ -72,7 +72,7 @@ def same_at_process(found: Explanation) -> list[Explanation]:
     return [found._replace(logs=found.logs + np.log(UNLISTED), candidates=(other,), entries=found.entries or (c,))]
 
 
-def parted(found: Explanation, listed: Sequence[Candidate]) -> list[Explanation]:
+def split_by_kind(found: Explanation, listed: Sequence[Candidate]) -> list[Explanation]:
     """Return a broken actuator as a stuck one and as one that lost a share, of the listed kinds; others unchanged.
 
     Of several faults every broken actuator is taken apart, in all combinations.

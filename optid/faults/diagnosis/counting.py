@@ -25,7 +25,7 @@ SMALL = 1e-3
 """Singular values below which an error of a signature is neglected."""
 
 
-def recounted(found: Explanation, uncertainty: ModelUncertainty | None) -> Explanation:
+def with_model_uncertainty(found: Explanation, uncertainty: ModelUncertainty | None) -> Explanation:
     """Return an explanation by one candidate with the errors of its signature.
 
     Without uncertain parameters, or without a signature, it is returned unchanged.
@@ -54,7 +54,7 @@ def recounted(found: Explanation, uncertainty: ModelUncertainty | None) -> Expla
     logs = logs + bounded_shares((candidate,), nu, spread)
     return found._replace(
         logs=logs, sizes=nu, covariances=spread, energies=energy + 2 * changed, error=error
-    ).likely()
+    ).without_negligible_onsets()
 
 
 def trace_error(scan: "Scan", uncertainty: ModelUncertainty, candidate: Candidate, onset: int, size: Array) -> Nuisance:

@@ -137,5 +137,5 @@ def _noises(found: Dictionary, noises: list[Candidate], white: Whitened) -> list
         explanations.append(Explanation(
             (candidate,), every[:, None], logs, means[near][:, None], spreads[near][:, None, None], 2 * highest[near],
             course=rest,
-        ).likely())
+        ).without_negligible_onsets())
     return explanations

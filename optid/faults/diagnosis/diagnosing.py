@@ -13,7 +13,7 @@ from optid.faults.diagnosis.alternatives import final_effect
 from optid.faults.diagnosis.answers import Answer, Certificate, Diagnosis, Estimate, Evidence
 from optid.faults.diagnosis.courses import LONGEST
 from optid.faults.diagnosis.posterior import estimates
-from optid.faults.diagnosis.ranking import NOTHING, Fit, find
+from optid.faults.diagnosis.ranking import NOTHING, Fit, explain_record
 from optid.faults.diagnosis.record_search import Question, RecordSearch, search_record
 from optid.faults.diagnosis.records import (
     lost_sensors,
@@ -119,7 +119,7 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
     first = search_record(record, part, found, asked, noise)
     notes = [remark, cut, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u)),
              *extrapolated(model, part.u), *first.extrapolated]
-    seen, ranking, alarm = find(first)
+    seen, ranking, alarm = explain_record(first)
     notes.append(ranking.note)
     fits = ranking.fits if not found.unknown or ranking.explains else ()
     if alarm and not fits:

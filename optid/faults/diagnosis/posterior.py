@@ -77,7 +77,7 @@ class Explanation(NamedTuple):
     error: Nuisance | None = None
     entries: tuple[Candidate, ...] = ()
 
-    def likely(self) -> "Explanation":
+    def without_negligible_onsets(self) -> "Explanation":
         """Return the explanation without onsets of negligible probability."""
         kept = self.logs > self.logs.max() - NEGLIGIBLE
         return self._replace(
@@ -85,7 +85,7 @@ class Explanation(NamedTuple):
             covariances=self.covariances[kept], energies=self.energies[kept],
         )
 
-    def made(self) -> Explained:
+    def fit_to_window(self) -> Explained:
         """Return the fit of the most probable onsets to the window."""
         onsets, sizes = self.onsets[self.best], self.sizes[self.best]
         if self.course is not None:
@@ -138,7 +138,8 @@ def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
     covariances = np.swapaxes(roots, 1, 2) @ roots
     sizes = np.einsum("kij,kj->ki", covariances, along)
     logs = marginal(row[onsets], candidate.dimension) - np.log(onsets.size)
-    found = Explanation((candidate,), onsets[:, None], logs, sizes, covariances, row[onsets], scan).likely()
+    whole = Explanation((candidate,), onsets[:, None], logs, sizes, covariances, row[onsets], scan)
+    found = whole.without_negligible_onsets()
     return found._replace(logs=found.logs + bounded_shares(found.candidates, found.sizes, found.covariances))
 
 
@@ -178,7 +179,7 @@ def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int]
     logs = np.where(apart, logs, -np.inf) if apart.any() else logs
     logs = logs + bounded_shares(candidates, sizes, covariances)
     where = np.stack([there[row] for there, row in zip(ranges, rows)], axis=1)
-    return Explanation(tuple(candidates), where, logs, sizes, covariances, energies, scan).likely()
+    return Explanation(tuple(candidates), where, logs, sizes, covariances, energies, scan).without_negligible_onsets()
 
 
 def least_squares(gram: Array, correlation: Array, floor: float = 1e-6) -> tuple[Array, Array, Array, np.ndarray]:

@@ -8,10 +8,10 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import SolverFailed, StructureError
-from optid.faults.consistency.leftover import UNFIT, further_fault, left_over
-from optid.faults.diagnosis.alternatives import UNLISTED, declares_process, parted, same_at_process
+from optid.faults.consistency.leftover import UNFIT, further_fault, remainder_test
+from optid.faults.diagnosis.alternatives import UNLISTED, declares_process, same_at_process, split_by_kind
 from optid.faults.diagnosis.answers import Certificate, Remaining
-from optid.faults.diagnosis.counting import recounted
+from optid.faults.diagnosis.counting import with_model_uncertainty
 from optid.faults.diagnosis.posterior import Explanation, several, single, smallest_set
 from optid.faults.diagnosis.record_search import RecordSearch
 from optid.faults.search.programmes import solved
@@ -85,7 +85,7 @@ class Ranking(NamedTuple):
         return any(fit.remaining.p_value > UNFIT for fit in self.fits)
 
 
-def find(seen: RecordSearch) -> tuple[RecordSearch, Ranking, bool]:
+def explain_record(seen: RecordSearch) -> tuple[RecordSearch, Ranking, bool]:
     """Return the search, its ranking by the chosen method, and whether there is an alarm."""
     alarm, unproved = seen.p_value <= seen.asked.false_alarm, ""
     if seen.asked.method == "set":
@@ -149,8 +149,8 @@ def singles(seen: RecordSearch) -> list[Explanation]:
     for search, candidate, prior in able:
         found = None if search is None else single(search, candidate)
         if found is not None:
-            counted = recounted(found._replace(logs=found.logs + prior), seen.noise.get("uncertainty"))
-            result += parted(counted, seen.dictionary.candidates)
+            counted = with_model_uncertainty(found._replace(logs=found.logs + prior), seen.noise.get("uncertainty"))
+            result += split_by_kind(counted, seen.dictionary.candidates)
             if seen.dictionary.unknown and not declares_process(seen.dictionary):
                 result += same_at_process(counted)
     return result + seen.gains_of_sensors + seen.courses
@@ -162,7 +162,7 @@ def _several(seen: RecordSearch, found: SubsetSearch, reach: int = 1) -> list[Ex
     result: list[Explanation] = []
     for subset in near:
         if subset.gain > near[0].gain - FAR:
-            result += parted(_around(seen, subset.labels, subset.onsets, reach), seen.dictionary.candidates)
+            result += split_by_kind(_around(seen, subset.labels, subset.onsets, reach), seen.dictionary.candidates)
     return result
 
 
@@ -193,7 +193,7 @@ def ranked(seen: RecordSearch, explanations: Sequence[Explanation]) -> Ranking:
 
 
 def _fit(seen: RecordSearch, explanation: Explanation, probability: float) -> Fit:
-    made = explanation.made()
+    made = explanation.fit_to_window()
     rest = made.rest if explanation.error is None else explanation.error(made.rest)
     further, penalty, search, limits = 1.0, 0.0, seen.search, seen.limits
     if search is not None and limits is not None:
@@ -205,7 +205,7 @@ def _fit(seen: RecordSearch, explanation: Explanation, probability: float) -> Fi
             penalty = float(np.nansum([limits.q[search.index(c)] for c in own]))
         elif explanation.search is not None:
             penalty = float(np.nanmax(limits.q))
-    left = left_over(seen.whitened, rest, seen.dictionary.model.nx + made.magnitudes, further)
+    left = remainder_test(seen.whitened, rest, seen.dictionary.model.nx + made.magnitudes, further)
     return Fit(explanation, probability, float(explanation.energies[explanation.best] - penalty), made.fitted, left)
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from optid.arrays import Array, check_integer, check_probability
 from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError, nearest
-from optid.faults.consistency.leftover import alarm_probability, left_over
-from optid.faults.diagnosis.alternatives import extended
+from optid.faults.consistency.leftover import alarm_probability, remainder_test
+from optid.faults.diagnosis.alternatives import with_unlisted_candidates
 from optid.faults.diagnosis.courses import courses, without_signature
 from optid.faults.diagnosis.outliers import cleaned, with_spikes
 from optid.faults.diagnosis.posterior import Explanation
@@ -129,7 +129,7 @@ class RecordSearch:
     @cached_property
     def beside(self) -> Scan | None:
         """The search for candidates beside the dictionary; None without any."""
-        more = extended(self.dictionary)
+        more = with_unlisted_candidates(self.dictionary)
         return None if more is None else scan(more, self.whitened, self.part.u)
 
     @cached_property
@@ -183,7 +183,7 @@ def search_record(
     else:
         white = whitened_of(part)
         gains = np.full((len(found.candidates), len(white.r)), np.nan)
-    healthy = left_over(white, white.r, found.model.nx)
+    healthy = remainder_test(white, white.r, found.model.nx)
     return RecordSearch(record, given, found, asked, noise, part, white, search, limits, gains, lost, healthy, outliers)
 
 

@@ -79,7 +79,7 @@ def sensor_gains(
             return Explained(white.r - left, left, 1)
 
         explanations.append(Explanation((candidate,), onsets[:, None], logs, mean[:, None], variance[:, None, None],
-                                        2 * most, course=rest).likely())
+                                        2 * most, course=rest).without_negligible_onsets())
     return explanations
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optid.data.description import listed_findings
+from optid.phrases import p_value
 
 if TYPE_CHECKING:
     from optid.faults.diagnosis.answers import Diagnosis, Estimate
@@ -21,7 +22,7 @@ WORDS = {
 HEADLINES = {
     "healthy": "no alarm",
     "untestable": "the input excites none of the candidates",
-    "not isolable": "a fault, which one output does not isolate",
+    "not isolable": "a fault that cannot be isolated from a single output",
     "unknown": "a fault that is none of the candidates",
 }
 """Headline of a verdict without an answer."""
@@ -129,7 +130,7 @@ def certificate_words(found: "Diagnosis") -> str:
         tried = "every candidate and onset was tried" if proof.kind == "exhaustive" else "a grid of onsets was tried"
         words = f"proof: {tried}; energy explained beyond its threshold {proof.value:.1f}"
         if np.isfinite(proof.runner_up_margin):
-            words += f", twice the log of the odds against the next {proof.runner_up_margin:.1f}"
+            words += f", twice the log-odds against the runner-up {proof.runner_up_margin:.1f}"
         return words
     if proof.kind == "flat line":
         return f"proof: {proof.value:.0f} readings in a row are identical or missing"
@@ -222,6 +223,4 @@ def _list(words: list[str]) -> str:
 
 def probability_words(value: float) -> str:
     """Write a probability."""
-    if value < 1e-300:
-        return "< 1e-300"
-    return "unknown" if np.isnan(value) else f"{value:.2g}" if value >= 1e-3 else f"{value:.0e}"
+    return p_value(value, 2 if value >= 1e-3 else 1, missing="unknown")

@@ -207,7 +207,7 @@ def cusum_arl(shift: float, k: float = 0.5, h: float = 5.0, *, two_sided: bool =
 
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     nodes, weights = (nodes + 1) * h / 2, weights * h / 2
-    starts = np.concatenate([[0.0], nodes])  # the sum may stay at zero, which has a probability of its own
+    starts = np.concatenate([[0.0], nodes])  # the sum may stay at zero, which has its own probability
     kernel = np.empty((starts.size, starts.size))
     kernel[:, 0] = ndtr(k - starts - shift)
     step = nodes[None, :] - starts[:, None] + k - shift

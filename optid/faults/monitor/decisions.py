@@ -25,9 +25,10 @@ RULES = {
 
 A fault is isolated once its posterior reaches `certainty`, or after `patience` samples. An alarm ends after `still`
 samples with all statistics below `release` of their thresholds. An isolated fault is carried `settle` samples later.
-A transient ends when its energy falls to `faded`. A carried fault is no longer estimated when the error of its size has
-the energy `learned` in a window, and is cleared when its significance falls below the share `forgiven` of the
-threshold. No candidate explains an alarm when the residual energy is `odd` standard deviations too large.
+A transient ends when its energy falls to `faded`. The size of a carried fault is no longer estimated once its standard
+error, propagated over a window, has an energy below `learned`; the fault is cleared when its significance falls below
+the share `forgiven` of the threshold. No candidate explains an alarm when the residual energy is `odd` standard
+deviations too large.
 
 Where more windows than a tenth reach the energies that a tenth of the simulated ones reach, the noise has another
 colour than that of the calibration: the thresholds are then multiplied by the ratio of these energies, by `adapt` at

@@ -16,6 +16,7 @@ from optid.faults.signatures import Dictionary
 from optid.faults.whitening import OTHER_SCALE, Predictor, health, whiten
 from optid.models import NoiseCovariances
 from optid.models.experiments import in_units_of
+from optid.phrases import p_equals
 
 if TYPE_CHECKING:
     from optid.faults.monitor.monitoring import Monitor
@@ -74,7 +75,7 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
     return effect, np.nan_to_num(np.concatenate(inputs))
 
 
-def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
+def with_noise_of(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
     """Return a dictionary with the noise of a healthy record, and a remark on the change.
 
     Samples after an input left its identified range are not used. Innovations that are white and of the predicted size
@@ -103,7 +104,7 @@ def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
             _check_rise(float(every.mean()) / usual, f"the energy of the innovations of {name}", energies, usual, BLOCK)
     signals = [np.where(part.present, part.innovations, np.nan) for part in parts]
     taps, covariance = _autoregression(signals, (0,) if judged.white else ORDERS)
-    said = (f"on the healthy record the innovations are not those of the model (whiteness p = {judged.p_value:.2g}, "
+    said = (f"on the healthy record the innovations are not those of the model (whiteness {p_equals(judged.p_value)}, "
             f"size {judged.ratio:.2f} times the predicted one): its noise is taken from that record"
             + (f", as an autoregression of order {len(taps)}." if taps else "."))
     return _recoloured(found, taps, covariance), said
@@ -211,7 +212,7 @@ def _check_rise(factor: float, what: str, levels: list[Array], usual: float, len
     warnings.warn(text + ".", DataWarning, stacklevel=4)
 
 
-def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calibration:
+def raise_thresholds(monitor: "Monitor", healthy: Data, base: Calibration) -> Calibration:
     """Return thresholds with no more alarms on a healthy record than are due: those of `base` times a factor.
 
     A record is rarely long enough for its false-alarm rate to be measured. The factor is one, unless more than a tenth

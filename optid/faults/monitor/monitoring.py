@@ -18,7 +18,7 @@ from optid.faults.monitor.arl import Calibration, calibrate
 from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
 from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
-from optid.faults.monitor.healthy_noise import calibrated_on, observed, parameter_effect, without_drift
+from optid.faults.monitor.healthy_noise import parameter_effect, raise_thresholds, with_noise_of, without_drift
 from optid.faults.monitor.readings import ReadingChecks
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT, expand
@@ -114,7 +114,7 @@ class Monitor:
         if drift is not None:
             found = without_drift(found, drift)
         if healthy is not None:
-            found, remark = observed(found, healthy)
+            found, remark = with_noise_of(found, healthy)
             remarks.append(remark)
         for remark in filter(None, remarks):
             warnings.warn(remark, DataWarning, stacklevel=2)
@@ -130,10 +130,10 @@ class Monitor:
         if thresholds is not None:
             self.calibration = self._given(thresholds, arl0)
         else:
-            f = self._rehearsed(u) if inputs is None else inputs
+            f = self._simulate_reference(u) if inputs is None else inputs
             self.calibration = self._simulated(f, effect, arl0, samples=samples, extrapolate=extrapolate)
             if healthy is not None:
-                self.calibration = calibrated_on(self, healthy, self.calibration)
+                self.calibration = raise_thresholds(self, healthy, self.calibration)
         self._use(self.calibration)
         if isinstance(x0, str) and x0 == "unknown":
             self.plant.lose()
@@ -204,7 +204,7 @@ class Monitor:
             raise StructureError(f"thresholds: give one positive number for each of {', '.join(self.labels)}.")
         return Calibration(self.labels, q, float(arl0), self.window, 0, 0, None, np.ones(len(q)))
 
-    def _rehearsed(self, u: ArrayLike | None) -> Array:
+    def _simulate_reference(self, u: ArrayLike | None) -> Array:
         model = self.dictionary.model
         if not self.columns.losses:
             return np.zeros((0, model.B.shape[1]))
@@ -233,8 +233,8 @@ class Monitor:
         try:
             rows = [np.array(part, dtype=float).reshape(1, size) for part, size in ((u, model.m), (y, model.l))]
         except (ValueError, TypeError):
-            raise DataError(f"sample {self.samples}: u = {u!r} and y = {y!r}; {model.m} and {model.l} numbers are "
-                            "needed, NaN for a missing one.") from None
+            raise DataError(f"sample {self.samples}: u = {u!r} and y = {y!r}; give {model.m} and {model.l} "
+                            "numbers, NaN for a missing one.") from None
         return self.run(*rows)
 
     def run(self, u: ArrayLike, y: ArrayLike) -> list[Event]:
@@ -249,7 +249,7 @@ class Monitor:
         if len(u) != len(y):
             raise DataError(f"u has {len(u)} samples and y has {len(y)}: they must be equally long.")
         return [event for start in range(0, len(u), BLOCK)
-                for event in self._take_in(u[start : start + BLOCK], y[start : start + BLOCK])]
+                for event in self._process_block(u[start : start + BLOCK], y[start : start + BLOCK])]
 
     def watched(self, u: Array, y: Array) -> Array:
         """Return the statistics (N, C) along a record in raw units without decisions; the monitor is unchanged."""
@@ -260,7 +260,7 @@ class Monitor:
         twin.run(u, y)
         return np.vstack(twin.decisions.kept)
 
-    def _take_in(self, u: Array, y: Array) -> list[Event]:
+    def _process_block(self, u: Array, y: Array) -> list[Event]:
         start, count = self.samples, len(u)
         f, screened = self._expanded(u), self.checks.screen(u, y, start)
         y, fed, unsure = screened.y, self._fed(screened.y), screened.unsure[:, self._input_of]
@@ -281,7 +281,7 @@ class Monitor:
                 events += self._adapt() if adapts else []
                 continue
             if k in screened.frozen:
-                self._excuse(screened.frozen[k])
+                self._clear_fault(screened.frozen[k])
             if screened.distance[k] > 1:
                 self.decisions.leave_range(self.samples, float(screened.distance[k]))
             self._search_sample(f[k], fed[k], y[k], unsure[k], bool(screened.repeating[k]), events)
@@ -350,7 +350,7 @@ class Monitor:
         self.acknowledge()
         self.plant.lose()
 
-    def _excuse(self, onset: int) -> None:
+    def _clear_fault(self, onset: int) -> None:
         """Discard the effects of a sensor that has been found frozen."""
         if self.decisions.phase != WATCHING and self.search.peak.any() and self.decisions.alarm >= onset:
             self.decisions.forgive(self.search)

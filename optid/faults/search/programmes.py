@@ -67,7 +67,7 @@ def profile(found: "Scan", label: str, prior: str = "auto", **how: Any) -> "Prof
 def noise_covariance(found: "Dictionary", whitened: "Whitened", **how: Any) -> "CovarianceMatch":
     """Match the covariances of a window by additional noise in several places (`fault.noise_covariance`).
 
-    The candidates are those of kind "noise", or, where there are none, every place of the others. Further arguments
+    The candidates are those of kind "noise"; if there are none, one for each place in the dictionary. Further arguments
     are form, lags, onset and constraints.
     """
     return solved("fault.noise_covariance", found, whitened, **how)

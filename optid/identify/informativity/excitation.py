@@ -15,6 +15,7 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.identify.design.rules import LONGEST, Check, many_lines, remaining_shares
 from optid.identify.informativity.signals import RecordSignals
+from optid.phrases import plural
 
 ONE_MOVE = 4  # numbers that one move determines
 MOST_LINES, LINES = 3, 1e-4  # sinusoids that are looked for; share of the variance that they must leave at most
@@ -120,7 +121,7 @@ def hopeless(signals: RecordSignals, inputs: tuple[str, ...], found: list[InputE
                     "drift of the output")
         left = max((len(u) - 1 - int(np.flatnonzero(np.diff(u))[0]) for u in signals.inputs(c) if np.ptp(u)), default=0)
         if left <= AFTER:
-            return (f"input {one.input!r} moves for the first time {left} sample{'s' * (left > 1)} before the end: its "
+            return (f"input {one.input!r} moves for the first time {plural(left, 'sample', '')} before the end: its "
                     "effect is not in the record")
     for first, second in combinations(range(len(inputs)), 2):
         x, y = (np.concatenate(signals.inputs(c)) for c in (first, second))
@@ -149,7 +150,7 @@ class Copy:
     @property
     def sentence(self) -> str:
         """What it is, and what to do."""
-        samples = f"{abs(self.late)} sample{'s' * (abs(self.late) > 1)} "
+        samples = f"{plural(abs(self.late), 'sample', '')} "
         when = f"{samples}later" if self.late > 0 else f"{samples}before" if self.late else "the same sample"
         if self.controller:
             return (f"cannot be identified: input {self.input!r} is {self.factor:.4g} times output {self.output!r} but "

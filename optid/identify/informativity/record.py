@@ -12,6 +12,7 @@ from optid.identify.informativity.excitation import InputExcitation, copies, exc
 from optid.identify.informativity.feedback import TIED, Loop, loop, outside, setpoint
 from optid.identify.informativity.process import Process, processes
 from optid.identify.informativity.signals import RecordSignals
+from optid.phrases import p_equals, plural
 from optid.registry import Rendered
 from optid.threads import one_thread
 
@@ -176,7 +177,7 @@ def _findings(found: Informativity, data: Data, reason: str) -> list[str]:
     sentences = [reason] if reason else []
     for name, one in zip(found.inputs, found.loops):
         if one.word == "closed":
-            seen = "by one law at most samples" if one.follows else f"p = {one.p_value:.1g}"
+            seen = "by one law at most samples" if one.follows else p_equals(one.p_value, 1)
             sentences.append(
                 f"closed loop: output {one.output!r} acts on input {name!r} ({seen}); use lags from 1 "
                 "on and a noise model (bj.exact, armax.exact, or arx with many lags), and move the set-point")
@@ -196,7 +197,7 @@ def _findings(found: Informativity, data: Data, reason: str) -> list[str]:
             if dead:
                 interval = f"; 95 %: {low} to {high}" if high > low else ""
                 time = interval_text(dead * data.dt, data.time_unit)
-                samples = f"{dead} sample{'s' * (dead > 1)}"
+                samples = plural(dead, "sample", "")
                 # further poles than those found act like a dead time
                 what = "dead time" if response.poles.size < 2 else "apparent dead time"
                 size = f"{time} ({samples}{interval})" if data.time_unit else f"{samples}{interval}"

@@ -1,6 +1,6 @@
 """The signals of a record as its tests read them, and the regressions of one output behind low-order dynamics.
 
-Every experiment has a level of its own. What is left of its state from before the first sample is a decay at the
+Every experiment has its own level. What is left of its state from before the first sample is a decay at the
 slowest pole; with a pole at 1 it is a slope. Both are projected out, with the level.
 """
 

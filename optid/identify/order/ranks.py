@@ -19,6 +19,7 @@ import numpy as np
 
 from optid.arrays import Array, check_probability
 from optid.errors import RankError, StructureError
+from optid.phrases import p_equals
 from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import HankelStatistics, RegressionRows, hankel_statistics
 from optid.statistics.rq import rq
@@ -98,8 +99,8 @@ class RankTest:
             return f"{n}: singular value {n + 1} is rounding ({self.singular_values[n]:.1e})"
         if self.exhausted:
             return f"{n}: every smaller order is rejected and the block rows show no larger one; use more block rows"
-        before = f", order {n - 1} is rejected (p = {self.p_values[n - 1]:.1g})" if n else ""
-        return f"{n}: the following singular values are noise (p = {self.p_values[n]:.2g}){before}"
+        before = f", order {n - 1} is rejected ({p_equals(self.p_values[n - 1], 1)})" if n else ""
+        return f"{n}: the following singular values are noise ({p_equals(self.p_values[n])}){before}"
 
 
 def ratios_of(values: Array, floor: float) -> Array:

@@ -26,7 +26,7 @@ CREEPING = 5  # steps over which progress is measured
 FLAT, CREPT = 1e-8, 1e-10
 # relative gain of a full step below which a start counts as arrived; only the best of them descends further
 COMPARED = 1e-6
-# damping, relative to the squared sensitivities, beneath which steps need more digits than a Gram matrix has
+# damping, relative to the squared sensitivities, below which the normal equations lose too many digits: use QR
 DAMPED = 1e-7
 # damping that remains where errors are nonlinear in the states: a Gram matrix then serves all steps but the last
 GRAM = 1e-14

@@ -216,7 +216,7 @@ def errors_and_starts(plan: Plan, nx: int, found: dict[str, HammersteinSS], crit
         data, shifts = levelled(data)
     unknowns = StateUnknowns(nx, plan.expansion(), data.n_experiments, plan.direct(), criterion,
                              plan.offset and shifts is None, levels=shifts is not None)
-    # similarity takes away the freedom of as many unknowns as A has entries
+    # a similarity transformation removes nx² degrees of freedom
     enough_rows(outputs_present(data), "output samples", unknowns.size - nx**2, "states")
     variances = np.nanvar(np.vstack([e.y for e in data.experiments]), axis=0)
     errors = StateErrors(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)),

@@ -31,8 +31,8 @@ STALLED = 1e-6
 NOWHERE = 1e-9  # relative violation that is rounding; a step to more than that pays for it
 ROUNDING = 1e-14  # share of the energy of the record below which differences of sums of squares are rounding
 PATIENCE = 5  # undamped programmes in all that may promise no more than `STALLED` before it counts as nothing
-# a step onto the constraints is taken where the sum of squares is up to so many times what its linear model said, and
-# from this damping on, with which it is nearly the shortest one, in any case
+# accept a feasibility step if the sum of squares is at most TRUSTED times its linear prediction; with damping above
+# NEAR always: it is then nearly the shortest step
 TRUSTED, NEAR = 10.0, 1e-2
 CONFLICT = 0.1  # share of the errors above the free optimum from which descents from other signs are worth their time
 SIGNED = 60  # programmes of a descent from other signs, which goes on only where it is better

@@ -39,8 +39,8 @@ class ProcessUnknowns(Unknowns):
     experiments: int
     constant: bool = True  # whether there is one level of the output
     drift: bool = False  # whether the level moves along a straight line
-    free: bool = False  # whether every experiment begins with a motion of its own
-    levels: bool = False  # whether every experiment has a level of its own
+    free: bool = False  # whether every experiment begins with its own motion
+    levels: bool = False  # whether every experiment has its own level
     innovations: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @property

@@ -10,7 +10,7 @@ from typing import Any
 MOMENT = 0.01  # CPU seconds until it is raised again where it could not get out
 
 
-class OutOfTime(BaseException):  # noqa: N818 - an event, which nothing between may take for an error of its own
+class OutOfTime(BaseException):  # noqa: N818 - an event, which nothing between may take for its own error
     """The CPU time is over."""
 
 

@@ -20,7 +20,7 @@ def binary(data: Data) -> bool:
 def determined_bases(data: Data, word: str, apart: bool = False) -> Any:
     """Return a basis for all inputs, with as many functions as the samples of each determine.
 
-    With every experiment `apart` each has a level of its own, which hides what differs between them.
+    With every experiment `apart` each has its own level, which hides what differs between them.
     """
     runs = [_runs(data, c) for c in range(data.m)]
     found = [_determined(word, several if apart else [np.concatenate(several)]) for several in runs]

@@ -81,7 +81,7 @@ class Ladder:
 
     @property
     def levels_differ(self) -> bool:
-        """Whether every experiment has a level of its own."""
+        """Whether every experiment has its own level."""
         return self.levels is not None and self.levels.offset == "each"
 
     def bases(self, word: str) -> Any:

@@ -34,15 +34,15 @@ from optid.identify.search.trial import (
     OUT_OF_TIME,
     Candidate,
     Trial,
+    cheap_settings,
     continued,
     leaves,
-    spared,
     tried,
 )
 from optid.identify.verdict import Verdict
 from optid.packing import Unsendable, pack
 from optid.progress import Meter, log
-from optid.registry import Rendered, named_constraint
+from optid.registry import Rendered, read_constraints
 from optid.threads import one_thread
 
 BUDGET, INTERRUPT = "the budget", "an interrupt"
@@ -146,13 +146,13 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     data.refuse_irregular("a search")
     most = effort_of(effort)
     if budget is not None and (not is_number(budget) or not budget > 0 or LARGEST < budget < np.inf):
-        raise StructureError(f"budget is a number of seconds above 0; got {shown(budget)}")
+        raise StructureError(f"budget must be a positive number of seconds; got {shown(budget)}")
     Settings(accuracy)  # every trial would refuse it
     for word in classes:
         one_of("classes", word, KINDS)
     if horizon is not None:
         check_integer(horizon, "horizon")
-    rules = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)
+    rules = read_constraints(constraints)
     compared = data if data.n_samples <= LONG else stretches(data, COMPARED)
     cut = Blocks.of(compared, blocks)
     ladder, stopped = Ladder.of(cut, data.n_experiments > 1), ""
@@ -346,7 +346,7 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial], open_kinds: Sequence[str]
     for kind, several in tried_of.items():
         if kind not in best and several:
             nearest = max(several, key=lambda t: t.estimation)
-            found.append(f"{kind}: none of {len(several)} structures could be better than what is chosen; of the one "
+            found.append(f"{kind}: none of {len(several)} structures could be better than the chosen one; of the one "
                          f"that fits best, {nearest.candidate.formulation} {nearest.candidate.words}: {nearest.reason}")
     if open_kinds:
         parts = [f"{kind} {f'ended after {len(tried_of[kind])} structures' if tried_of[kind] else 'not reached'}"
@@ -376,7 +376,7 @@ def _refitted(chosen: Trial, data: Data, blocks: Blocks, horizon: int | None, se
             return found
 
     def as_tried(record: Data, **more: Any) -> Fit:
-        return fit(record, candidate.formulation, **settings, **{**spared(candidate), **arguments, **more})
+        return fit(record, candidate.formulation, **settings, **{**cheap_settings(candidate), **arguments, **more})
 
     if chosen.restarted is None:
         return as_tried(data)
@@ -399,7 +399,7 @@ def _summary(ladder: Ladder, kind: str) -> str:
 
 def _nothing(trials: Sequence[Trial]) -> Exception:
     if not trials:
-        return RankError("no structure could be tried: the budget was over before the first")
+        return RankError("no structure was tried: the budget ended before the first one was fitted")
     words = [t.reason for t in trials]
     common = max(set(words), key=words.count)
     return SolverFailed(f"none of {len(trials)} structures could be fitted and cross-validated; most often: {common}")

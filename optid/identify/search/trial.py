@@ -162,7 +162,7 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
     try:
         with cpu_limit(seconds), warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # the fit that is chosen tells them
-            arguments = {**spared(candidate), **candidate.under(constraints), **_bases(candidate, blocks.data)}
+            arguments = {**cheap_settings(candidate), **candidate.under(constraints), **_bases(candidate, blocks.data)}
             for known in _steps(found, fitted(blocks.data), fitted, blocks, rival, horizon):
                 found = known
                 if known.reason:
@@ -289,7 +289,7 @@ def near(score: float) -> float:
     return max(EQUAL * (100 - score), min(SMALL, SMALLER * (100 - score)))
 
 
-def spared(candidate: Candidate) -> dict[str, Any]:
+def cheap_settings(candidate: Candidate) -> dict[str, Any]:
     """Return the arguments that make a trial faster than the final fit."""
     if candidate.formulation.endswith("oe.exact"):
         return {"starts": STARTS}

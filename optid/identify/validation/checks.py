@@ -28,6 +28,7 @@ from optid.identify.validation.predictions import (
 )
 from optid.identify.validation.structure import Structure, structure_test
 from optid.models.functions import StaticFunction, has_feedback, static_functions
+from optid.phrases import p_equals
 from optid.registry import Rendered
 from optid.threads import one_thread
 
@@ -260,8 +261,8 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
     if not found.passed:
         notes.append(
             f"The record is {found.finding}; modelling this would reduce the residual variance by "
-            f"{100 * found.saving:.2g} % (p = {found.p_value:.1g}). Consider functions of latent signals (lfr.exact), "
-            "a Wiener model, or nonlinear feedback.")
+            f"{100 * found.saving:.2g} % ({p_equals(found.p_value, 1)}). Consider functions of latent signals "
+            "(lfr.exact), a Wiener model, or nonlinear feedback.")
     return found
 
 

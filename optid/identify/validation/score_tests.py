@@ -1,7 +1,7 @@
 """Score tests: do further columns reduce what a hypothesis leaves of an output?
 
 The errors are whitened by an autoregression, which is as valid for noise of any colour: filtering in time changes
-neither the hypothesis nor the alternative. Every experiment has a level and decays of its own, which are projected out.
+neither the hypothesis nor the alternative. Every experiment has its own level and decays, which are projected out.
 Source: Lagrange-multiplier tests of nonlinear regressions (Engle 1984).
 """
 

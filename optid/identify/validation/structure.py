@@ -108,7 +108,7 @@ def structure_test(data: Data, simulated: Sequence[Array] | None = None, found: 
 
 
 def _test(hypothesis: Hypothesis) -> dict[str, FTest]:
-    """Return the test of every alternative that the record tells apart from the hypothesis."""
+    """Return the test of every alternative that the record distinguishes from the hypothesis."""
     table, regression = alternatives(hypothesis), hypothesis.regression
     if hypothesis.rounding and regression.spare > hypothesis.tangent.shape[1]:  # fewer rows are met by anything
         return {next(iter(table)): FTest()}
@@ -122,6 +122,6 @@ def _test(hypothesis: Hypothesis) -> dict[str, FTest]:
         if test is not None:
             found[name] = test
     if not found:
-        raise RankError(f"no alternative can be told apart from the hypothesis in {regression.spare} complete samples "
-                        "with these inputs: use a longer record, with more levels and moves")
+        raise RankError(f"no alternative can be distinguished from the hypothesis in {regression.spare} complete "
+                        "samples with these inputs: use a longer record, with more levels and moves")
     return found

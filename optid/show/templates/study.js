@@ -40,7 +40,7 @@ function drawStandings() {
   const growth = (one) => one.growth.slope === null ? "-" : element("span", {}, `N^${one.growth.slope.toFixed(2)}`,
     element("span", { class: "faint" }, ` (${one.growth.low.toFixed(2)} to ${one.growth.high.toFixed(2)})`));
   const columns = [
-    { name: "solver", title: "solver", hint: "★ the first choice; tied: not to be told apart from it", head: true, value: (s) => s.solver, node: (s) => element("span", {}, swatch(s.solver), " ", s.solver,
+    { name: "solver", title: "solver", hint: "★ the first choice; tied: no significant difference from it", head: true, value: (s) => s.solver, node: (s) => element("span", {}, swatch(s.solver), " ", s.solver,
       section.first === s.solver && section.kind === "first" ? element("span", { class: "mark" }, " ★") : section.kind === "tie" && (section.first === s.solver || section.tied.includes(s.solver)) ? element("span", { class: "faint" }, " tied") : null) },
     { name: "solved", title: "accuracy reached on", hint: "problems it was run on, and where it reached the verified accuracy", number: true, descending: true, value: (s) => s.share, node: shareBar },
     { name: "time", title: "time", hint: "shifted geometric mean on what it solved: compares only where others solved the same", number: true, value: (s) => s.time, text: (s) => duration(s.time) },

@@ -51,7 +51,7 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
     except Exception as error:
         raise StudyError(f"workers cannot import {function!r}: {error}") from None
     with connected(scheduler, packages(todo)) as client:
-        flight = _Flight(client, packed)
+        flight = _PendingCell(client, packed)
         try:
             yield from flight.rows(todo)
         finally:
@@ -68,7 +68,7 @@ def _versions(cell: Cell) -> dict[str, str]:
     return determining(cell.formulation_name, cell.solver_name, cell.data_source.system is not None)
 
 
-class _Flight:
+class _PendingCell:
     """The submitted cells of a cluster."""
 
     def __init__(self, client: Any, function: bytes) -> None:

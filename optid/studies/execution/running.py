@@ -72,10 +72,10 @@ def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, ret
         return grid, grid, ""
     with Store(db) as store, store.copy() as copy:
         todo = _prepared(copy, study, grid, accept_changed_data, retry)
-        return grid, todo, told_former(copy, study)
+        return grid, todo, describe_previous_run(copy, study)
 
 
-def told_former(store: Store, study: Study) -> str:
+def describe_previous_run(store: Store, study: Study) -> str:
     """Return a text on the superseded rows of a study and the reasons; empty if there are none."""
     axes = {"data": study.data, "formulation": study.formulations, "solver": study.solvers}
     known_labels = [{entry.name for entry in entries} for entries in axes.values()]

@@ -2,6 +2,7 @@
 
 from collections import Counter
 
+from optid.phrases import plural
 from optid.show.wording import seconds
 from optid.studies.verdicts.averages import paired
 from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE
@@ -9,7 +10,7 @@ from optid.studies.verdicts.model_advice import choice_of_formulation
 from optid.studies.verdicts.quality import Quality
 from optid.studies.verdicts.ranks import SolverRanking
 from optid.studies.verdicts.standings import Standing, StandingsSection
-from optid.studies.verdicts.statement import BAD, FAIR, GOOD, NO_DIFFERENCE, Statement, counting, listed, of, plural
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, NO_DIFFERENCE, Statement, counting, listed, of
 
 RARE = 0.01  # share of refused problems, or of false claims, up to which a solver is recommended
 LONGEST = 90  # characters of a headline

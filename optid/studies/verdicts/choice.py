@@ -90,7 +90,7 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
     leaders = [s for s in unbeaten if counts[s] >= max(counts[unbeaten]) - allowed]
     common = known[:, leaders].all(axis=1)
     if not leaders or not common.any():
-        circle = f"goes in a circle: each of {listed(candidates)} is behind another one on the {noun}s that both solve"
+        circle = f"has no order: of {listed(candidates)}, each is beaten by another one on the {noun}s that both solve"
         missing = f"needs a {noun} that {listed([names[s] for s in leaders])} all solve" if leaders else circle
         return Choice(CANNOT_TELL, "", (), candidates, {}, solved, missing)
     lead = min(leaders, key=lambda s: compare(np.where(common, costs[:, s], np.nan), np.ones(len(costs))).value)

@@ -119,7 +119,7 @@ def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> StudyVerdict:
     caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. A study of at least 6 problems "
                        "(optid study run) shows which solver to prefer on others.", "data sets")
     said = [statement for statement in verdict.statements if statement.about != "data sets"]
-    head = replace(head, text=head.text[:1].upper() + head.text[1:])  # a sentence of its own on the page
+    head = replace(head, text=head.text[:1].upper() + head.text[1:])  # its own sentence on the page
     return replace(verdict, headline=head, statements=(caveat, *said))
 
 

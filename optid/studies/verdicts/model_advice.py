@@ -1,9 +1,10 @@
 """The comparison of formulations by their models, in words."""
 
+from optid.phrases import plural
 from optid.studies.verdicts.averages import Paired
 from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, TIE, Choice
 from optid.studies.verdicts.quality import FEW, DataSet, Quality
-from optid.studies.verdicts.statement import FAIR, GOOD, NO_DIFFERENCE, Statement, listed, of, plural
+from optid.studies.verdicts.statement import FAIR, GOOD, NO_DIFFERENCE, Statement, listed, of
 
 UNDECIDED = "Models: cannot tell"
 LISTED = 4  # data sets in a sentence

@@ -33,7 +33,7 @@ MEANINGS = {
     INFEASIBLE: "the solver claims that no point satisfies the constraints; the claim has no point to verify",
     str(Status.UNBOUNDED): "the solver claims that the objective has no lower bound",
     str(Status.LIMIT): "the solver stopped at its own limit of iterations or time",
-    str(Status.INACCURATE): "the point misses the tolerance of its own accuracy, but not by enough for a false claim",
+    str(Status.INACCURATE): "the point misses the tolerance of its accuracy, but by too little for a false claim",
     str(Status.FAILED): "no point to judge, or a point far from the claim",
 }
 """The meaning of the states in the failure table, beyond the outcomes of a row."""

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+from optid.phrases import plural
 from optid.program.solution import tolerance
 
 Key = TypeVar("Key")
@@ -29,11 +30,6 @@ def grouped(pairs: Iterable[tuple[Key, str]]) -> dict[Key, list[str]]:
     for key, word in pairs:
         found.setdefault(key, []).append(word)
     return found
-
-
-def plural(n: int, noun: str) -> str:
-    """Write "1 problem", "3 problems"."""
-    return f"{n:,} {noun}{'' if n == 1 else 's'}"
 
 
 def counting(accuracy: float) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from optid.errors import DataError
+from optid.phrases import plural
 from optid.studies.storage.rows import ERROR, REFUSED, columns
 from optid.studies.verdicts.advice import carries_over, choice_of_solver, headline, no_solution
 from optid.studies.verdicts.agreement import Agreement, agreement_matrix
@@ -26,7 +27,7 @@ from optid.studies.verdicts.outcomes import (
 )
 from optid.studies.verdicts.quality import Quality, compare_formulations
 from optid.studies.verdicts.standings import StandingsSection, compare_solvers
-from optid.studies.verdicts.statement import BAD, FAIR, Statement, grouped, listed, plural
+from optid.studies.verdicts.statement import BAD, FAIR, Statement, grouped, listed
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,21 @@
+"""Counts and p values in words, the same in every message, table and page."""
+
+import math
+
+SMALLEST = 1e-16
+"""Smallest p value that is printed; the figures below are rounding errors of the tail."""
+
+
+def plural(n: int, noun: str, mark: str = ",") -> str:
+    """Write "1 problem", "3,000 problems", with a mark between groups of digits or none ("")."""
+    return f"{n:{mark}} {noun}{'' if n == 1 else 's'}"
+
+
+def p_value(p: float, digits: int = 2, missing: str = "-") -> str:
+    """Write the number of a table: "0.03", "< 1e-16"; `missing` for NaN."""
+    return missing if math.isnan(p) else f"< {SMALLEST:g}" if p < SMALLEST else f"{p:.{digits}g}"
+
+
+def p_equals(p: float, digits: int = 2) -> str:
+    """Write "p = 0.03", or "p < 1e-16"."""
+    return f"p {p_value(p, digits)}" if p < SMALLEST else f"p = {p_value(p, digits)}"
