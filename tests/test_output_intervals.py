@@ -242,6 +242,8 @@ def test_active_inequalities_widen_one_side_only():
     assert fit.uncertainty.source.kind == "projected" and np.max(np.abs(below / above - 1)) > 1e-3
     part = quietly(lambda: fit.simulate(v[:50], interval=0.95))  # in one block, the other in two
     assert part.upper == pytest.approx(found.upper[:50], rel=1e-9)
+    long = quietly(lambda: fit.simulate(np.r_[v, np.zeros(1200)], interval=0.95))  # by fewer draws
+    assert np.max(np.abs(long.upper[:900] - found.upper) / above) < 0.01
 
 
 # -- what is said, and what is refused ---------------------------------------------------------------------------------
