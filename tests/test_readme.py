@@ -120,3 +120,10 @@ def test_the_formulation_of_the_contributing_guide_is_conformant():
     names: dict = {}
     exec(next(block for block in text.split("```python\n")[1:] if "def fir" in block).split("```")[0], names)
     check_formulation(names["fir"], example("dead_zone").data, nb=20)
+
+
+def test_the_citation_file_has_the_version_and_the_licence_of_the_project():
+    cited = dict(re.findall(r"^([\w-]+): (\S.*)$", (HOME / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE))
+    project = (HOME / "pyproject.toml").read_text(encoding="utf-8")
+    assert f'version = "{cited["version"]}"' in project and f'license = "{cited["license"]}"' in project
+    assert cited["cff-version"] == "1.2.0" and cited["type"] == "software"
