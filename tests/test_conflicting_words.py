@@ -56,6 +56,10 @@ def test_measured_curvature_is_that_of_the_sum_of_squares(seed):
 
     class Bent:
         @staticmethod
+        def admissible(x):
+            return True
+
+        @staticmethod
         def linearise(x):
             e = errors + matrix @ x + np.einsum("kij,i,j->k", bends, x, x) / 20
             rows = np.column_stack([matrix + np.einsum("kij,j->ki", bends, x) / 10, e])

@@ -36,8 +36,8 @@ def test_1_success_at_an_infeasible_stationary_point_is_not_believed():
     assert claim.word == "optimal"  # the evidence: x² = -1 has no solution
     found = solve(program, believed)
     assert found.status is Status.FAILED and "circle" in found.reason
-    assert solve(program, "uno").status is Status.INFEASIBLE
-    assert solve(program, "ipopt").status is Status.INFEASIBLE
+    for name in ("uno", "ipopt"):  # they say so too, which no convex relaxation confirms
+        assert solve(program, name).status is Status.FAILED and "infeasib" in solve(program, name).reason
 
 
 def test_1_multipliers_of_an_earlier_solve_are_not_handed_on():

@@ -253,7 +253,7 @@ class _Watch:
 
         self.watcher, self.reader, self.state, source = watcher, reader, state, watcher.source or {}
         self.strict, self.as_json, self.skips = habits
-        self.plant = source["model"]
+        self.plant = source.get("model")
         self.bad, self.saved, self.place = source.get("bad", 0), watcher.samples, source.get("place")
         self.stamps = {int(sample): stamp for sample, stamp in source.get("stamps", [])}
         self.lines: list[str] = []  # of events that are not printed yet

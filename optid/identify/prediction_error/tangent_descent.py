@@ -176,7 +176,7 @@ def _with_poles(fit: TangentFit, x: Array, rules: tuple[Any, ...], figures: Mapp
     """Fit everything but the poles of x again, under rules."""
     word = fit.criterion.dynamics
     part = fit.criterion.unknowns.parts(x)[word]
-    still = fit.under((*rules, lambda view: {"poles": view[word] == part}))
+    still = fit.under(rules, lambda view: {"poles": view[word] == part})
     return (yield from _constrained(_Iterate.of(still, x), figures, MOVED))
 
 

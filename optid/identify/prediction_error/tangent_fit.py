@@ -101,9 +101,10 @@ class TangentFit:
         """The user's constraints."""
         return self.problem.builders
 
-    def under(self, constraints: Sequence[Any]) -> "TangentFit":
-        """Return the fit under other constraints."""
-        return replace(self, problem=replace(self.problem, builders=tuple(constraints)))
+    def under(self, constraints: Sequence[Any], *restrictions: Any) -> "TangentFit":
+        """Return the fit under other constraints of the user, and further restrictions that are not the user's."""
+        return replace(self, problem=replace(self.problem, builders=tuple(constraints), restrictions=(
+            *self.problem.restrictions, *restrictions)))
 
     def recover(self, values: Values) -> Any:
         """Return the model of the values of the unknowns."""
