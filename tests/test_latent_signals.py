@@ -492,6 +492,7 @@ def test_functions_of_latent_signals_are_bent_as_asked_or_the_question_is_refuse
     assert held.solution.objective == pytest.approx(free.solution.objective, rel=0.2)
     for rule, words in ((shape.monotone("increasing", "z1"), "slope of the function of z1"),
                         (shape.even("z1"), "slope of the function"), (shape.gain(1.0, channel="z1"), "no static"),
-                        (shape.convex("z2"), "a latent signal is z1"), (shape.monotone("decreasing", "z1"), "sign of z1 is arbitrary")):
+                        (shape.convex("z2"), "a latent signal is z1"),
+                        (shape.monotone("decreasing", "z1"), "sign of z1 is arbitrary")):
         with pytest.raises(StructureError, match=words):
             fit(rule)

@@ -237,7 +237,8 @@ def test_a_full_disk_ends_no_monitor(tmp_path, monkeypatch, capsys, what):
     with StateFile(tmp_path / "full.npz") as kept:
         monitor = watch(undisturbed.dictionary.model, undisturbed.dictionary, 40, 35.0)
         reader = RowReader(["u1", "u2"], ["y1", "y2"], dt=1.0)
-        monitoring._Watch(monitor, reader, tmp_path / "grown.csv", kept, monitoring._Habits(False, True, False)).run(True)
+        habits = monitoring._Habits(False, True, False)
+        monitoring._Watch(monitor, reader, tmp_path / "grown.csv", kept, habits).run(True)
     told = capsys.readouterr()
     assert told.out.splitlines() == whole and Monitor.load(kept.path).samples == undisturbed.samples
     errors = " ".join(told.err.split())
