@@ -23,6 +23,7 @@ from optid.identify.validation.predictions import fit_percent, one_step_or_nan, 
 from optid.identify.validation.systematic import systematic
 from optid.models.functions import has_feedback, step_length
 from optid.phrases import p_equals
+from optid.registry import render
 from optid.threads import one_thread
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
@@ -81,6 +82,9 @@ class Verdict:
     def misfits(self) -> tuple[Finding, ...]:
         """The parts that find an error of the response beyond that of the parameters."""
         return tuple(part for part in self.failed if part.name in MISFIT and part.counts)
+
+    def _repr_html_(self) -> str:
+        return render(self, "html")
 
     def __str__(self) -> str:
         return f"{self.word}: " + "; ".join(

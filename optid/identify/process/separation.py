@@ -91,8 +91,8 @@ def warn_of_motion(errors: ProcessErrors, best: ProcessPoint) -> str:
     p = float(fisher.sf(gain / left.shape[1] / max((best.value - gain) / dof, 1e-300), left.shape[1], dof))
     if p >= MOVING or gain <= EXACT * errors.energy:
         return ""
-    found, of = f"not at rest (p = {p:.1g})", errors.data.outputs[0]
-    warnings.warn(f"output {of!r} does not begin at rest under its first inputs (p = {p:.1g}): initial='free' "
+    found, of = f"not at rest ({p_equals(p, 1)})", errors.data.outputs[0]
+    warnings.warn(f"output {of!r} does not begin at rest under its first inputs ({p_equals(p, 1)}): initial='free' "
                   "estimates a motion of its own for every experiment; gain and time constants are biased without it",
                   DataWarning, stacklevel=2)
     return found
