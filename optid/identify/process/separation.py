@@ -10,6 +10,7 @@ from optid.errors import DataWarning, RankError
 from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.starts import usual_box
+from optid.phrases import p_equals
 
 CHANCE = 1e-3  # p value of the F test above which the output does not visibly respond
 MOVING, EXACT = 1e-4, 1e-12  # p value, and share of the energy of the output, below which a motion counts as none
