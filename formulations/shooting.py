@@ -56,7 +56,7 @@ def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk:
           constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True) -> Problem:
     """Minimise the simulation errors with the simulated outputs as variables.
 
-    Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x``.
+    Named variables: ``Theta``, ``a``, ``b``, ``kappa``, ``mu``, ``offset``, ``w``, ``x``.
 
     Arguments as in `formulations.prediction_error.hammerstein_bj`, as are the errors raised; constraints may be any
     smooth ones in the named variables. A record that is too long is refused (`StructureError`).

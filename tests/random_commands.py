@@ -156,6 +156,9 @@ def draw(seed: int, files: dict[str, list[Path]]) -> tuple[list[str], Path]:
     command = commands()[name]
     words, given = [*name.split(), *ALWAYS.get(name, ())], set(ALWAYS.get(name, ()))
     for argument in (p for p in command.params if p.param_type_name == "argument"):
+        if argument.name == "name":  # of a formulation
+            words += [one(["bj.exact", "fault.profile", "hammerstein_arx.exact", "bj.exct", ""])][: int(r.integers(2))]
+            continue
         some = files[{"files": "model", "target": "data"}.get(argument.name, argument.name)]
         if argument.name == "target":
             words.append(one(["rows.csv", "rows.csv", "rows.parquet", "rows.parquet", "rows.xlsx", "no/rows.csv"]))

@@ -131,4 +131,4 @@ def test_a_flat_valley_is_followed_and_not_called_an_optimum():
     fit = optid.fit(excited(8, np.abs), "lfr.exact", nx=2, tries=1, constraints=["stable:0.7"], raises=False)
     assert fit.solution.status is Status.LIMIT
     assert fit.solution.objective < 22.7  # where linear errors promise 1e-7 of 22.80
-    assert "flat valley" in fit.solution.reason
+    assert "flat valley" in fit.solution.reason or "or creep" in fit.solution.reason

@@ -295,7 +295,7 @@ def test_a_formulation_documents_the_variables_it_poses(name):
     if hasattr(problem, "view"):
         view = problem.view
     elif "shooting" in name or "ss.exact" in name or "lfr" in name:  # behind the steps that find the start
-        view = last_programme(problem).view
+        view = programme_of(last_programme(problem)).view
     else:
         view = programme_of(next(problem)).view
     assert set(found.variables) == set(view) - ({*plant.states, *plant.parameters} if name == "physical" else set())

@@ -64,8 +64,9 @@ def test_every_help_prints_in_ascii(command):
 
 def test_what_optid_prints_has_readable_substitutes():
     home = Path(optid.__file__).parent
+    read_only = home / "data" / "reading" / "clock.py"  # words of many languages for a clock, which are never printed
     written = {c for path in [*home.rglob("*.py"), *(home.parent / "formulations").rglob("*.py")]
-               for c in path.read_text(encoding="utf-8") if not c.isascii()}
+               if path != read_only for c in path.read_text(encoding="utf-8") if not c.isascii()}
     without = {c for c in written | set("σμθλφΩ₁₂⁻−≤≥→≈½éšŁ") if "?" in substitute(c)}
     assert not without
 

@@ -11,6 +11,7 @@ from optid.certificate.lifting import lift
 from optid.core.least_squares import RankOneForm
 from optid.core.program import as_program
 from optid.registry import formulation
+from optid.solving.proofs import proof_of
 
 SETS = {
     "cone": [shape.monotone()],
@@ -53,7 +54,7 @@ def test_a_point_that_is_not_optimal_is_never_proved():
         mu = np.sort(rng.normal(size=7))
         b = rng.normal(size=2)
         values = {**fit.solution.values, "mu": np.delete(mu - mu[3], 3), "b": b / np.linalg.norm(b)}
-        bound, _ = program.certify(program, values, {})
+        bound, _ = proof_of(program, values, {})
         assert not bound.proved
         assert bound.value <= fit.solution.objective * (1 + 1e-8)
 

@@ -431,7 +431,7 @@ def test_a_loss_without_excitation_gets_no_verdict_alone():
     _, events = watched(found, u, Fault.loss("actuator:u1", 250, 1.0), 5, 50, 30.0)
     (named,) = [event for event in events if event.kind == "isolated"]
     assert named.candidates[0][0] == "actuator:u1 stuck"
-    assert named.sample >= 250 + 10 and "looks like a constant bias" in named.note
+    assert named.sample >= 250 + 10 and "not isolable from a constant" in named.note
 
 
 def test_a_spike_is_a_spike():

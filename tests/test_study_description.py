@@ -636,10 +636,10 @@ IN_CLASS = [("dead_zone_in_span", "hammerstein_arx.exact"), ("ding_chen", "hamme
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name, formulation", IN_CLASS)
 def test_a_model_of_the_class_has_no_error_without_noise(name, formulation):
-    from optid.cli.arguments import suited
+    from optid.cli.arguments import drop_foreign_options
 
     data, truth = simulate(name, 800, 0.0, seed=1)
-    arguments = suited(SYSTEMS[name].suggestion, formulation)
+    arguments = drop_foreign_options(SYSTEMS[name].suggestion, formulation)
     if name == "dead_zone_in_span":  # its basis, on the interval of its nodes
         arguments["basis"] = optid.Triangular(8, interval=(-1.0, 1.0))
     with np.errstate(all="ignore"):
