@@ -69,7 +69,7 @@ def ss(data: Data, *, nx: int | str, block_rows: int | Sequence[int] | None = No
        ) -> Procedure:
     """Minimise the simulation error of a linear model with its states as variables.
 
-    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``offset``, ``output``, ``residual``, ``states``, ``x0``.
+    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``offset``, ``output``, ``states``, ``x0``.
     Arguments as in `hammerstein_ss`, as are the errors raised.
     """
     return _fit("ss", data, nx, block_rows=block_rows, weighting=weighting, offset=offset, feedthrough=feedthrough,
@@ -84,7 +84,7 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
                    constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a Hammerstein model, with output feedback or without, its states as variables.
 
-    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``mu``, ``offset``, ``output``, ``residual``, ``states``,
+    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``mu``, ``offset``, ``output``, ``states``,
     ``x0``. Other arguments as in `formulations.state_space.hammerstein_ss`.
 
     Args:
@@ -111,7 +111,7 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
     """Minimise the simulation error of a model with functions of latent signals, its states as variables.
 
     Named variables: ``A``, ``C``, ``Theta``, ``b``, ``b latent``, ``mu``, ``mu latent``, ``offset``, ``output``,
-    ``residual``, ``signal of z``, ``states``, ``x0``, ``z``. Other arguments as in `formulations.latent_signals.lfr`,
+    ``signal of z``, ``states``, ``x0``, ``z``. Other arguments as in `formulations.latent_signals.lfr`,
     errors raised as in `hammerstein_ss`.
 
     Args:

@@ -115,7 +115,7 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
     elif given is not None:
         best = lagrangian.measure(rows, given)
     else:
-        best = (np.nan, np.nan) if is_large(problem, rows) else (np.inf, np.inf)
+        best = (np.inf, np.inf) if _size(problem, rows) <= LARGEST else (np.nan, np.nan)
     unsure = rows and not np.isnan(best[0]) and not best[0] <= UNCONFIRMED
     if unsure and (own := _fitted(problem, x, rows, lagrangian)) is not None:
         again = lagrangian.measure(rows, own)
@@ -332,7 +332,7 @@ def _fitted(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], lagrangian
     for name, place in problem.slices.items():
         units[place] = variable_size(x[name], problem.space.usual_sizes.get(name))
     held = [gauge[None] for gauge, _ in gauges(problem, x)]
-    if is_large(problem, rows) or not np.all(np.isfinite(lagrangian.gradient)):
+    if _size(problem, rows) > LARGEST or not np.all(np.isfinite(lagrangian.gradient)):
         return None
     parts = [row.gradients() for row in rows]
     slopes = np.vstack([np.zeros((0, problem.size)), *held, *(slope for slope, _ in parts)])
@@ -346,9 +346,9 @@ def _fitted(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], lagrangian
     return [weights[a:b] @ stands for a, b, (_, stands) in zip(counts, counts[1:], parts)]
 
 
-def is_large(problem: Problem, rows: Sequence[RowsAtPoint]) -> bool:
-    """Return whether the slopes of all constraints are too many for least squares of multipliers."""
-    return sum(len(row.constraint) for row in rows) * problem.size > LARGEST
+def _size(problem: Problem, rows: Sequence[RowsAtPoint]) -> int:
+    """Return the number of entries of the slopes of all constraints."""
+    return sum(len(row.constraint) for row in rows) * problem.size
 
 
 def _directions(count: int) -> Array:

@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
+from scipy.sparse import issparse
 
 from optid.arrays import Array
 from optid.core.constraint import symmetric_part
-from optid.core.judge import LagrangianAtPoint, RowsAtPoint, gauges, is_large, rows_at
+from optid.core.judge import LagrangianAtPoint, RowsAtPoint, gauges, rows_at
 from optid.core.problem import Problem
 from optid.core.terms import Values
 from optid.program.limits import slope_of
@@ -59,9 +60,9 @@ def least_multipliers(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], 
                       ) -> Callable[[str, Array], Array] | None:
     """Return, for an effect of the multipliers of a named constraint, those of all at the point that have the least.
 
-    None where they are unique, not polyhedral, or too many.
+    None where they are unique, not polyhedral, or too many (slopes are sparse).
     """
-    if is_large(problem, rows) or any(row.constraint.cone == "psd" for row in rows):
+    if any(issparse(row.slope) or row.constraint.cone == "psd" for row in rows):
         return None
     lagrangian = LagrangianAtPoint.of(problem, x)
     floor = lagrangian.floor()
