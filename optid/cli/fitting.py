@@ -48,7 +48,9 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
     with working(saved, report) as work:
         from optid.cli import arguments as words
 
-        how = words.at_stamps(how, formulation)
+        if data:  # examples have no stamps: a wrong name is refused before anything large is imported
+            import_cvxpy()
+            how = words.at_stamps(how, formulation)
         record, suggestion = words.record(data, how, example, seed, stream=stream, scheduler=scheduler)
         import_cvxpy()
         from optid.identify.fitting import fit as fit_model
