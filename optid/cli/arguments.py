@@ -84,8 +84,10 @@ def at_stamps(how: dict[str, Any], formulation: str) -> dict[str, Any]:
 
     `LookupFailed` for an unknown formulation.
     """
+    from optid.lazy import import_cvxpy
     from optid.registry import formulation as look_up
 
+    import_cvxpy()
     any_times = getattr(look_up(formulation)[1], "takes_any_times", False)
     return {**how, "gaps": "stamps"} if any_times and how["gaps"] is None and how["resample"] is None else how
 

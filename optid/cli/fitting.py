@@ -49,7 +49,6 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
         from optid.cli import arguments as words
 
         if data:  # examples have no stamps: a wrong name is refused before anything large is imported
-            import_cvxpy()
             how = words.at_stamps(how, formulation)
         record, suggestion = words.record(data, how, example, seed, stream=stream, scheduler=scheduler)
         import_cvxpy()

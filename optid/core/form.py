@@ -6,8 +6,8 @@ from typing import Any, ClassVar, Self
 class Form:
     """A form of problems, with the numbers behind one of them and the names of the unknowns they belong to.
 
-    A back end lists the forms it takes (`optid.backends.BackEnd.forms`), so that a new form needs its class and a back
-    end, and no change here.
+    A back end names the `of` of the form that it takes (`optid.backends.BackEnd`, ``takes``), so that a new form needs
+    its class and a back end, and no change here.
 
     Attributes:
         word: its name in messages and in the list of solvers.

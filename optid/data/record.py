@@ -14,6 +14,7 @@ from optid.data.channels import Channel, Ports, Transform, channel_fields, inter
 from optid.data.description import Description, instant
 from optid.data.timeline import Timeline, read_times, seconds_of, starts_of
 from optid.errors import DataError, nearest
+from optid.lazy import import_pandas
 from optid.phrases import plural
 from optid.registry import render
 
@@ -260,10 +261,7 @@ class Data(Ports):
         Raises:
             DataError: pandas is not installed.
         """
-        try:
-            import pandas as pd
-        except ImportError:
-            raise DataError('to_pandas needs pandas: pip install "optid[tables]"') from None
+        pd = import_pandas()
         times = [pd.Index(time, name="time") for time in as_list(self.time)]
         frames = [pd.DataFrame(record, index, [*self.inputs, *self.outputs])
                   for record, index in zip(self.records, times)]

@@ -8,6 +8,7 @@ import numpy as np
 
 from optid.arrays import Array, check_probability
 from optid.errors import DataError, LookupFailed, OptidError, nearest
+from optid.lazy import import_pandas
 from optid.models.functions import StaticFunction, free_parameters, static_functions
 from optid.registry import Rendered
 
@@ -75,11 +76,7 @@ class Parameters(Rendered, Sequence):
         Raises:
             DataError: pandas is not installed.
         """
-        try:
-            import pandas
-        except ImportError:
-            raise DataError('to_pandas needs pandas: pip install "optid[tables]"') from None
-        return pandas.DataFrame(self.rows, columns=Parameter._fields).set_index("name")
+        return import_pandas().DataFrame(self.rows, columns=Parameter._fields).set_index("name")
 
 
 def parameters(fit: Any, level: float = 0.95) -> Parameters:
