@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Sequence
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -253,3 +254,11 @@ def check_shape(array: np.ndarray, what: str) -> None:
             f"{what} has shape {array.shape}: {channels} channels but only {rows} sample(s). "
             "Time runs along the first axis; pass the transpose (x.T) if the array is channels by samples."
         )
+
+
+def import_pandas() -> Any:
+    """Return pandas, which frames need; `DataError` where it is not installed."""
+    try:
+        return import_module("pandas")
+    except ImportError:
+        raise DataError('to_pandas needs pandas: pip install "optid[tables]"') from None

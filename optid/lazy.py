@@ -6,8 +6,6 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-from optid.errors import DataError
-
 POSTPONED = {"scipy.stats": "entropy", "scipy.signal": "fftconvolve"}
 """What CVXPY imports for one function each; both together take as long as the rest of it."""
 
@@ -54,14 +52,6 @@ def import_cvxpy() -> None:
     finally:
         for name in stand_ins:
             del sys.modules[name]
-
-
-def import_pandas() -> Any:
-    """Return pandas, which frames need; `DataError` where it is not installed."""
-    try:
-        return import_module("pandas")
-    except ImportError:
-        raise DataError('to_pandas needs pandas: pip install "optid[tables]"') from None
 
 
 def _stand_in(name: str, function: str) -> ModuleType:

@@ -8,13 +8,12 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from optid.arrays import as_list, as_records, frozen, one_or_all
+from optid.arrays import as_list, as_records, frozen, import_pandas, one_or_all
 from optid.data import preprocessing
 from optid.data.channels import Channel, Ports, Transform, channel_fields, interval_text, listed, sampling_time
 from optid.data.description import Description, instant
 from optid.data.timeline import Timeline, read_times, seconds_of, starts_of
 from optid.errors import DataError, nearest
-from optid.lazy import import_pandas
 from optid.phrases import plural
 from optid.registry import render
 

@@ -6,9 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array, check_probability
+from optid.arrays import Array, check_probability, import_pandas
 from optid.errors import DataError, LookupFailed, OptidError, nearest
-from optid.lazy import import_pandas
 from optid.models.functions import StaticFunction, free_parameters, static_functions
 from optid.registry import Rendered
 
