@@ -193,18 +193,23 @@ def doubled(criterion: Criterion, depth: Callable[[Array], float], x: Array) -> 
     return None
 
 
-def slowed(criterion: Criterion, x: Array) -> Array | None:
-    """Return x with two neighbouring poles made real, one of them slow, and everything else fitted; None without two.
+def slowed(criterion: Criterion, x: Array) -> list[Array]:
+    """Return x with two neighbouring poles made slow, and everything else fitted: one of two real ones, or a pair.
 
-    With a slow pole the static gain, which words about f refer to, may oppose the first response.
+    With a slow pole the static gain, which words about f refer to, may oppose the first response. A pair that rings
+    through the record amplifies what f leaves, and keeps its frequency.
     """
     poles, slow = poles_of(criterion, x), float(np.exp(-SLOW / max(e.n_samples for e in criterion.data.experiments)))
     for pair in _couples(poles):
         two, others = poles[list(pair)], np.delete(poles, pair)
         fast = float(np.mean(two).real) if two[0].imag else float(two[0].real)
-        if fast < slow:
-            return _fitted(criterion, _moved(criterion, x, two, others, (fast + slow) / 2, ((slow - fast) / 2) ** 2))[0]
-    return None
+        moves = [((fast + slow) / 2, ((slow - fast) / 2) ** 2)] if fast < slow else []
+        if two[0].imag and abs(two[0]) < slow:
+            rings = two[0] * slow / abs(two[0])
+            moves.append((float(rings.real), -float(rings.imag) ** 2))
+        if moves:
+            return [_fitted(criterion, _moved(criterion, x, two, others, *move))[0] for move in moves]
+    return []
 
 
 def _step(criterion: Criterion, x: Array, hold_c: bool) -> tuple[Array, float]:

@@ -249,12 +249,14 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
     if best is not None and best.objective <= free * (1 + CONFLICT):
         return best
     known = about_poles(fit.constraints) or fit.criterion.dynamics not in fit.criterion.unknowns.slices
-    slow = None if known else slowed(fit.criterion, here.x)
-    held = None if known else (yield from _with_poles(fit, here.x, fit.constraints, figures))
+    slow = [] if known else slowed(fit.criterion, here.x)
+    held = []
+    for x in () if known else (here.x, *slow):
+        end = yield from _with_poles(fit, x, fit.constraints, figures)
+        held += [] if end is None else [fit.places.pack(end.values or {})]
     best = yield from _gone_on(fit, best, figures)
-    slow_ones = [] if slow is None else [slow, *fit.mirrored(slow, same=True)]
-    free_ones = [] if held is None else [fit.places.pack(held.values or {})]
-    for start in (*fit.mirrored(here.x, same=True), *fit.mirrored(here.x), *slow_ones, *free_ones):
+    slow_ones = [start for x in slow for start in (x, *fit.mirrored(x, same=True))]
+    for start in (*fit.mirrored(here.x, same=True), *fit.mirrored(here.x), *slow_ones, *held):
         end = yield from _constrained(_Iterate.of(fit, start), figures, SIGNED)
         if end is None or best is not None and not end.objective < best.objective * (1 + CONFLICT):
             continue
