@@ -10,6 +10,7 @@ import optid
 from optid.bases import Linear
 from optid.errors import DataWarning, StructureError
 from optid.identify.equation_error import reweighting as losses
+from optid.identify.verdict import verdict
 
 
 def soiled():
@@ -170,9 +171,14 @@ def test_readings_left_out_are_named_and_squares_keeps_them():
     robust = optid.fit(wild, na=2, nb=2, basis=BASIS, loss="huber")
     assert plain.figures["rows"] == 398 and "marked" not in plain.findings[0] and "NaN" in plain.findings[0]
     assert robust.figures["rows"] == 398 - 3 - 4 - 3 - 3
-    assert robust.figures["outliers of y"] == "samples 40, 90, 91, 250"
+    assert str(robust.figures["outliers of y"]) == "samples 40, 90, 91, 250"
     assert robust.findings[0].endswith("leaves out every row that contains one, as output or as past output")
     assert robust.findings[1].startswith("outliers by the residuals of y, sample 300, were left out")
+    # the verdict is that of the same model on the record without them
+    clean = y.copy()
+    clean[[40, 90, 91, 250, 300]] = np.nan
+    assert str(robust.verdict) == str(verdict(robust.model, optid.Data(u=data.u, y=clean)))
+    assert robust.verdict.score > plain.verdict.score + 10
 
 
 def test_a_disturbance_of_the_plant_is_no_wrong_reading():
@@ -194,4 +200,4 @@ def test_several_outputs_leave_out_the_rows_of_each():
     with pytest.warns(DataWarning, match="leaves out every row"):
         fit = optid.fit(optid.Data(u=u, y=y), "arx", na=2, nb=2, loss="huber")
     assert fit.figures["rows"] == 598 - 3 - 3 - 4
-    assert fit.figures["outliers of y2"] == "samples 77, 301"
+    assert str(fit.figures["outliers of y2"]) == "samples 77, 301"

@@ -24,7 +24,7 @@ def run(n):
 
 
 (u1, y1), (u2, y2) = run(300), run(180)
-y1[[50, 170]] += 30.0
+y1[[50, 171]] = 30.0
 data = optid.Data([u1, u2], [y1, y2], 0.1)
 data
 
@@ -35,6 +35,11 @@ print(*fit.findings, sep="\n")
 
 # %%
 fit.params
+
+# %%
+# The verdict counts neither missing samples nor the outliers that the loss has left out.
+figure = optid.plots.fit_over_time(fit)
+print(*(f"{part.name} {part.value}: {part.outcome}" for part in fit.verdict.parts), sep="\n")
 
 # %%
 # Files larger than memory are read in one pass: ``optid.fit(optid.open_stream("big.csv", ...), ...)`` takes the same

@@ -30,6 +30,7 @@ print("states:", study.nx)
 # Past inputs and outputs are instruments, which remain valid in closed loop.
 fit = optid.fit(data, "hammerstein_ss.asivid", nx=3, basis="polynomial:3")
 print("free run, fit in %:", fit.simulation_fit.round(1))
+print(*(f"{part.name}: {part.outcome}" for part in fit.verdict.parts), sep="\n")
 
 # %%
 figure = optid.plots.poles_and_response(fit)

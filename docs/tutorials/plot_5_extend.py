@@ -30,4 +30,9 @@ x, y = step(np.zeros(step.size1_in(0)), 0.4)
 assert abs(float(y) - free.simulate(np.array([0.4]))[0]) < 1e-12
 
 # %%
+# What the constraint leaves of the free function, and the verdict: all tests pass, the fit is that of a fair model.
+print(fit.verdict.word, fit.verdict.failed)
+figure = optid.plots.bode(fit)
+
+# %%
 # To add a formulation or a solver, write one file: see ``CONTRIBUTING.md``.

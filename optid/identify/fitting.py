@@ -31,7 +31,7 @@ from optid.errors import (
 from optid.identify.arguments import violations
 from optid.identify.dynamics import dynamics, input_levels
 from optid.identify.parameters import Parameters, criteria, parameters, uncertainty_or_reason
-from optid.identify.record_checks import examine, examine_figures
+from optid.identify.record_checks import examine, examine_figures, without_outliers
 from optid.models.functions import has_feedback
 from optid.phrases import plural
 from optid.program.prices import Price
@@ -176,7 +176,7 @@ class Fit(Rendered):
 
     @cached_property
     def verdict(self) -> Any:
-        """Tests of the model on the record (`optid.identify.verdict.Verdict`).
+        """Tests of the model on the record (`optid.identify.verdict.Verdict`), without outliers that the loss left out.
 
         None for a stream, a record at irregular times, or no model.
         """
@@ -188,7 +188,8 @@ class Fit(Rendered):
             known = self.uncertainty
         except OptidError:
             known = None
-        return verdict(self.model, self.data, *(self.cross_validated or (None, None)), known)
+        record = without_outliers(self.data, self.figures)
+        return verdict(self.model, record, *(self.cross_validated or (None, None)), known)
 
     @cached_property
     def advice(self) -> tuple[Any, ...]:

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,30 @@ NAMED = 5  # samples that a finding names
 EXAMINED = "outliers"  # of the figures of a fit with a robust loss
 BY_RESIDUALS = "outliers by the residuals"
 BLOCK_ROWS = 10  # of a subspace method that chooses them itself
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """The samples of an output, per experiment, that a robust loss left out as outliers; a figure of its fit."""
+
+    output: str
+    samples: tuple[np.ndarray, ...]
+
+    def __str__(self) -> str:
+        return list_samples(self.samples)
+
+
+def without_outliers(data: Data, figures: Mapping[str, Any]) -> Data:
+    """Return a record whose outputs are missing where the fit of these figures left them out as outliers."""
+    found = [value for value in figures.values() if isinstance(value, LeftOut)]
+    if not found:
+        return data
+    columns = [e.y.copy() for e in data.experiments]
+    for one in found:
+        for y, samples in zip(columns, one.samples):
+            y[samples, data.outputs.index(one.output)] = np.nan
+    kept = iter(columns)
+    return data.mapped(lambda u: u, lambda y: next(kept))
 
 
 def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | None = None) -> list[str]:

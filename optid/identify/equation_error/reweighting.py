@@ -26,7 +26,7 @@ from optid.data.streams import Stream
 from optid.errors import StructureError, nearest
 from optid.identify.equation_error.compression import EquationError, compress
 from optid.identify.outliers import MOST, NORMAL_MEDIAN, find_additive_outliers, find_outliers
-from optid.identify.record_checks import BY_RESIDUALS, EXAMINED, list_samples
+from optid.identify.record_checks import BY_RESIDUALS, EXAMINED, LeftOut
 from optid.program.solution import Bound, Solution, Status, relative_gap
 from optid.program.units import in_units
 from optid.solving.solve import Evidence, Procedure
@@ -190,9 +190,9 @@ class _Rows:
         by_residuals = [mask & ~known for mask, known in zip(self._outliers, self._examined)]
         for o, name in enumerate(self._layout.outputs):
             for word, masks in ((EXAMINED, self._examined), (BY_RESIDUALS, by_residuals)):
-                samples = [np.flatnonzero(mask[:, o]) for mask in masks]
+                samples = tuple(np.flatnonzero(mask[:, o]) for mask in masks)
                 if any(part.size for part in samples):
-                    found[f"{word} of {name}"] = list_samples(samples)
+                    found[f"{word} of {name}"] = LeftOut(name, samples)
         return found
 
 
