@@ -11,27 +11,26 @@
 Rules about the shape of h (`shape.convex`, `shape.odd`, ...) name the latent signal as their channel, "z1", "z2", ...;
 ``mu latent[z1]`` are the coefficients of h in its basis.
 
-The errors are minimised over all parts, z included, by the programmes of `formulations.state_space`.
+The errors are minimised over all parts, z included, by steps as in `formulations.state_space`.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from formulations.state_space import state_space_fit
-from optid.arrays import LARGEST_INTEGER, check_integer, one_of, shown
-from optid.bases import Bases, Basis, Polynomial, parse
+from formulations.state_space import factors, signals, state_space_fit
+from optid.bases import Bases
+from optid.core.problem import Problem
+from optid.core.terms import Errors
 from optid.data.record import Data
-from optid.errors import StructureError
 from optid.identify.arguments import in_memory
-from optid.identify.prediction_error.latent_search import add_channels, add_output_functions
+from optid.identify.prediction_error.latent_functions import latent_channels, output_functions
+from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
 from optid.solving.solve import Procedure
-from optid.statistics.state_unknowns import Latent, beyond_affine
 
 
 @subspace_steps(tangent="lfr.exact")
@@ -65,19 +64,7 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
     return state_space_fit(
         "lfr.exact", data, nx, basis=basis, criterion=criterion, block_rows=block_rows,
         weighting=weighting, offset=offset, feedthrough=feedthrough, stability=stability, initial=initial,
-        iterations=iterations, constraints=constraints, extend=extend)
-
-
-def latent_channels(channels: int, latent_basis: Any, latent: str, direct: bool, seed: int, iterations: int,
-                    tries: int) -> Callable[..., Any]:
-    """Return what adds the latent signals of `lfr` to an optimum without them; arguments and errors as there."""
-    check_integer(channels, "channels")
-    check_integer(seed, "seed", 0, LARGEST_INTEGER)
-    one_of("latent", latent, ("states+inputs", "states"))
-    inner = _on_latent(latent_basis)
-    one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
-    return partial(add_channels, channels=(one,) * channels, seed=seed, iterations=iterations,
-                   tries=check_integer(tries, "tries", 0))
+        iterations=iterations, constraints=constraints, extend=extend, pose=_problem)
 
 
 @subspace_steps(tangent="wiener_ss.exact")
@@ -95,8 +82,9 @@ def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",
         feedthrough: whether the inputs act on z at once.
         initial: linear models, or models of this structure, as additional starting points.
     """
-    return _fit("wiener_ss.exact", data, nx, output_basis, feedthrough, iterations, block_rows=block_rows,
-                weighting=weighting, stability=stability, initial=initial, constraints=constraints)
+    return _of_outputs(
+        "wiener_ss.exact", data, nx, output_basis, feedthrough, iterations, block_rows=block_rows,
+        weighting=weighting, stability=stability, initial=initial, constraints=constraints)
 
 
 @subspace_steps(tangent="hammerstein_wiener_ss.exact")
@@ -114,26 +102,35 @@ def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomi
         output_basis: basis of every h, on z in [-1, 1].
         initial: Hammerstein models, or models of this structure, as additional starting points.
     """
-    return _fit("hammerstein_wiener_ss.exact", data, nx, output_basis, False, iterations, basis=basis,
-                block_rows=block_rows, weighting=weighting, stability=stability, initial=initial,
-                constraints=constraints)
+    return _of_outputs(
+        "hammerstein_wiener_ss.exact", data, nx, output_basis, False, iterations, basis=basis,
+        block_rows=block_rows, weighting=weighting, stability=stability, initial=initial, constraints=constraints)
 
 
-def _fit(name: str, data: Data, nx: int | str, output_basis: Any, feedthrough: bool, iterations: int,
-         **settings: Any) -> Procedure:
-    inner = _on_latent(output_basis)
-    functions = tuple(Latent(inner, np.eye(inner.size), feeds=False, output=o, moved=feedthrough)
-                      for o in range(in_memory(data, "simulation errors").l))
-    extend = partial(add_output_functions, functions=functions, iterations=iterations)
+def _of_outputs(name: str, data: Data, nx: int | str, output_basis: Any, feedthrough: bool, iterations: int,
+                **settings: Any) -> Procedure:
+    extend = output_functions(output_basis, in_memory(data, "simulation errors").l, feedthrough, iterations)
     return state_space_fit(name, data, nx, criterion="simulation", feedthrough=feedthrough, iterations=iterations,
-                           extend=extend, **settings)
+                           extend=extend, pose=_problem, **settings)
 
 
-def _on_latent(given: Basis | str) -> Basis:
-    """Return the basis of a latent function, on [-1, 1]."""
-    basis = parse(given) if isinstance(given, str) else given
-    if not isinstance(basis, Basis):
-        raise StructureError(f"the basis of a latent signal is {shown(given)}: give one such as Polynomial(3) or its "
-                             "name, 'polynomial:3'")
-    outside = "extrapolate" if isinstance(basis, Polynomial) else "linear"
-    return replace(cast(Any, basis), interval=(-1.0, 1.0), outside=outside)
+def _problem(name: str, errors: StateErrors, x: np.ndarray, constraints: Sequence[Any]) -> Problem:
+    """Minimise ‖e‖² over A, [B; D] and f of every input, C, z, h and [Ez; Fz] of every latent signal, x0, from x."""
+    variables, facts = errors.variables, errors.facts()
+    latent = {f"z{i}": one for i, one in enumerate(errors.unknowns.latent, start=1)}
+    return Problem(
+        name,
+        start=variables.values(x),
+        terms=(Errors(variables.squares, variables.value),),
+        leaves=factors(errors), further=partial(_signals, errors), about=frozenset({"P", "Q"}),
+        model=partial(errors.model, constrained=bool(constraints)),
+        facts={**facts, "iterate": True, "bases": facts["bases"] | {z: one.basis for z, one in latent.items()},
+               "spans": {z: one.vectors for z, one in latent.items()}},
+        builders=tuple(constraints), **errors.common())
+
+
+def _signals(errors: StateErrors, variables: Mapping[str, Any], x: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return what constraints may also use: that of `formulations.state_space`, the functions of latent signals."""
+    return signals(errors, variables, x) | {
+        f"mu latent[z{i}]": one.vectors @ variables[errors.key("c", i - 1)]
+        for i, one in enumerate(errors.unknowns.latent, start=1) if one.row is None}

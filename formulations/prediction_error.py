@@ -37,14 +37,10 @@ from optid.bases import Bases
 from optid.core.leaves import Product
 from optid.core.problem import Problem
 from optid.core.terms import Errors
-from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.identify.gauges import FIXED
-from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.identify.prediction_error.transfer_fit import fit_transfer
-from optid.models import HammersteinTF, Nonlinearity
-from optid.program.units import outer_bases
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 
@@ -160,17 +156,15 @@ def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc:
 
 def _problem(name: str, errors: TransferErrors, optimum: Array) -> Problem:
     """Minimise ‖e‖² over the coefficients of A, B, C, D, the functions and the initial states."""
-    layout, units, places = errors.unknowns.layout, errors.units, Places.of(errors)
+    variables = errors.variables
     return Problem(
         name,
-        start=places.values(optimum),
-        terms=(Errors(places.squares, places.value),),
+        start=variables.values(optimum),
+        terms=(Errors(variables.squares, variables.value),),
         leaves=tuple(Product(errors.key("mu", c), errors.key("b", c), errors.gauge)
                      for c, free in enumerate(errors.unknowns.free) if free),
-        further=partial(_signals, errors), model=partial(transfer_model, errors),
-        facts={"iterate": True, "channels": layout.inputs, "gauge": errors.gauge, "units": units,
-               "bases": dict(zip(layout.inputs, outer_bases(layout.bases, units)))},
-        scale=errors.energy, unit=errors.unit, energy=errors.unit * errors.energy_of_record)
+        further=partial(_signals, errors), model=errors.model, facts={"iterate": True, **errors.facts()},
+        **errors.common())
 
 
 def _signals(errors: TransferErrors, variables: Mapping[str, Any], _: Any) -> dict[str, Any]:
@@ -196,25 +190,3 @@ def _signals(errors: TransferErrors, variables: Mapping[str, Any], _: Any) -> di
     elif "x0" in variables:
         found["x0"] = None
     return found
-
-
-def transfer_model(criterion: TransferErrors, values: Mapping[str, Array], signed: bool = True) -> HammersteinTF:
-    """Return the model of named values in the units of the record: the plant, and C/D where there is a noise filter.
-
-    The signs of f and B are those of the values; without `signed` f rises where the output rises.
-    """
-    layout, part = criterion.unknowns.layout, {name: np.asarray(value, dtype=float) for name, value in values.items()}
-    mus = [part.get(criterion.key("mu", c), np.ones(1)) for c in range(layout.m)]
-    a, levels = part.get("a", np.zeros(0)), None
-    if criterion.unknowns.levels:
-        levels = part["x0"].reshape(criterion.unknowns.memory, -1)[-1:].T
-        part["offset"] = levels.mean(axis=0)
-    model = HammersteinTF(
-        a=a, b=tuple(part[criterion.key("b", c)] for c in range(layout.m)),
-        nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(layout.bases, mus)), nk=layout.nk,
-        offset=part.get("offset", np.zeros(1)), levels=levels, gauge=criterion.gauge, c=part.get("c", np.zeros(0)),
-        d=part.get("d", np.zeros(0)) if criterion.unknowns.apart else None, **model_meta(criterion.data))
-    model = model if signed else model.turned(model.gain_signs)
-    if criterion.shifts is not None:
-        model = model.with_output_levels(criterion.shifts)
-    return model.with_transform(criterion.units)

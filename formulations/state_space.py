@@ -30,26 +30,20 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.constraints.poles import NO_EQUATION, asks_for_integrator
+from formulations.constraints.poles import NO_EQUATION, refuse_integrator
 from formulations.subspace_procedure import identified
 from optid.bases import Bases
 from optid.core.leaves import Leaf, Product
 from optid.core.problem import Problem
 from optid.core.terms import Errors, Values
-from optid.data.channels import Transform
 from optid.data.record import Data
-from optid.errors import StructureError
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.state_fit import fit_states
 from optid.identify.prediction_error.static_curve import static_curve
-from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
 from optid.models.roots import modal_weight
-from optid.program.units import outer_bases
 from optid.solving.solve import Procedure
-
-Array = np.ndarray
 
 
 @subspace_steps(tangent="hammerstein_ss.exact")
@@ -114,51 +108,43 @@ def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: 
         constraints=constraints)
 
 
-def _problem(name: str, errors: StateErrors, units: Transform, x: Array, constraints: Sequence[Any]) -> Problem:
-    """Minimise ‖e‖² over A, [B; D] and f of every input, C, feedback, latent functions and initial states, from x."""
-    expansion, places = errors.unknowns.expansion, Places.of(errors)
-    start = places.values(x)
-    names = [tuple(errors.key(word, c) for word in ("mu", "b", "static")) for c in range(expansion.m)]
-    leaves: list[Leaf] = [Product(mu, b, gauge="") for mu, b, _ in names if mu in start]
-    if not expansion.feedback and not errors.unknowns.latent:
-        leaves += [static_curve(*three) for three in names]
-    latent = {f"z{i}": one for i, one in enumerate(errors.unknowns.latent, start=1)}
-    bases = dict(zip(expansion.input_names, outer_bases(expansion.inputs, units)))
+def _problem(name: str, errors: StateErrors, x: np.ndarray, constraints: Sequence[Any]) -> Problem:
+    """Minimise ‖e‖² over A, [B; D] and f of every input, C, feedback and initial states, from x."""
+    variables, leaves = errors.variables, factors(errors)
+    if not errors.unknowns.expansion.feedback:
+        leaves += tuple(static_curve(*(errors.key(word, c) for word in ("mu", "b", "static")))
+                        for c in range(errors.data.m))
     return Problem(
-        name, start, terms=(Errors(places.squares, places.value),), leaves=tuple(leaves),
-        further=partial(_signals, errors), about=frozenset({"P", "Q"}),
-        model=partial(state_space_model, errors, bool(constraints)),
-        facts={"iterate": True, "gauge": "norm", "channels": expansion.input_names, "outputs": expansion.output_names,
-               "units": units, "bases": bases | {z: one.basis for z, one in latent.items()},
-               "spans": {z: one.vectors for z, one in latent.items()}},
-        builders=tuple(constraints), scale=errors.energy, energy=errors.energy_of_record)
+        name,
+        start=variables.values(x),
+        terms=(Errors(variables.squares, variables.value),),
+        leaves=leaves, further=partial(signals, errors), about=frozenset({"P", "Q"}),
+        model=partial(errors.model, constrained=bool(constraints)), facts={"iterate": True, **errors.facts()},
+        builders=tuple(constraints), **errors.common())
 
 
-def _signals(errors: StateErrors, variables: Mapping[str, Any], x: Values) -> dict[str, Any]:
-    """Return what constraints may also use: P held and Q = A P, Theta of linear inputs, functions of latent signals."""
+def factors(errors: StateErrors) -> tuple[Leaf, ...]:
+    """Return ``Theta = mu bᵀ`` of every input whose f is unknown; the objective fixes no scale between them."""
+    return tuple(Product(errors.key("mu", c), errors.key("b", c), gauge="")
+                 for c, free in enumerate(errors.unknowns.free) if free)
+
+
+def signals(errors: StateErrors, variables: Mapping[str, Any], x: Values) -> dict[str, Any]:
+    """Return what constraints may also use: P held and Q = A P, Theta of linear inputs, the mean of several levels."""
     unknowns, weight = errors.unknowns, modal_weight(x["A"])
     found = {"P": cp.Constant(weight), "Q": variables["A"] @ weight}
-    for c in range(unknowns.expansion.m):
-        if errors.key("mu", c) not in variables:
+    for c, free in enumerate(unknowns.free):
+        if not free:
             b = variables[errors.key("b", c)]
             found[errors.key("Theta", c)] = cp.reshape(b, (1, b.size), order="F")
-    for i, one in enumerate(unknowns.latent):
-        if one.row is None:
-            found[f"mu latent[z{i + 1}]"] = one.vectors @ variables[errors.key("c", i)]
     if unknowns.levels:
         states = cp.reshape(variables["x0"], (unknowns.memory, unknowns.experiments), order="F")
         found |= {"offset": cp.sum(states[unknowns.n :], axis=1) / unknowns.experiments, "x0": states[: unknowns.n]}
     return found
 
 
-def state_space_model(errors: StateErrors, constrained: bool, values: Values) -> HammersteinSS:
-    """Return the model of the values of the unknowns, in the units of the problem."""
-    found = errors.at(errors.unknowns.unpack(Places.of(errors).pack(values)))
-    return found.regauge("norm") if any(errors.unknowns.free) and not constrained else found
-
-
-def state_space_fit(name: str, data: Data, nx: int | str, *, constraints: Sequence[Any], **settings: Any) -> Procedure:
+def state_space_fit(name: str, data: Data, nx: int | str, *, constraints: Sequence[Any], pose: Any = _problem,
+                    **settings: Any) -> Procedure:
     """Fit a model in the units of the samples, and return it in those of the record; see `fit_states`."""
-    if asks_for_integrator(constraints):
-        raise StructureError(NO_EQUATION)
-    return fit_states(name, data, nx, constraints=constraints, pose=_problem, subspace=identified, **settings)
+    refuse_integrator(constraints, NO_EQUATION)
+    return fit_states(name, data, nx, constraints=constraints, pose=pose, subspace=identified, **settings)

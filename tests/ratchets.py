@@ -25,7 +25,7 @@ ROOT = Path(__file__).parent.parent
 RECORD = Path(__file__).with_name("ratchets.json")
 LONG_SIGNATURE = 8
 TERMS = ("optid.core.terms.", "optid.core.low_rank.")
-STATE_SPACE = ("formulations.state_space", "formulations.state_shooting", "formulations.latent_signals")
+STATE_SPACE = ("formulations.state_space", "formulations.simultaneous", "formulations.latent_signals")
 PARTICIPLES = set("""begun bent bought broken brought built caught chosen drawn driven fed felt found frozen given gone
 grown held hidden kept known laid led left lent lost made meant met paid said seen sent shown spent stuck sought sworn
 taken taught thrown told torn understood won worn written""".split())  # not those that are imperatives too: run, read

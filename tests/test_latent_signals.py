@@ -208,7 +208,7 @@ def criterion_with_a_function(basis, samples=300):
     data = Data(u, rng.normal(size=(samples, 1)))
     unknowns = StateUnknowns(2, expand(data, "linear"), 1, (True,), latent=(one,))
     x = 0.3 * rng.normal(size=unknowns.size)
-    return StateErrors(data, unknowns, np.eye(1)), x
+    return StateErrors(data, unknowns, np.eye(1), Transform.identity(data.m, 1)), x
 
 
 @pytest.mark.parametrize("outside", ["linear", "clamp"])

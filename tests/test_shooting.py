@@ -7,8 +7,8 @@ from refusals import refuses
 from test_noise_models import BASIS, MU, A, B, quiet, record, system
 
 import optid
-from formulations import shooting
 from formulations.constraints import shape
+from formulations.simultaneous import hammerstein_oe
 from optid.bases import Polynomial
 from optid.core.program import as_program
 from optid.data.record import Data
@@ -73,7 +73,7 @@ def test_two_inputs_without_a_constant_and_the_gauges():
 
 def test_no_poles():
     data = record(HammersteinTF([], (B,), (Nonlinearity(BASIS, MU),), (1,), 0.3, d=()), (200,))
-    ours = optid.fit(data, shooting.exact, na=0, nb=2, nk=1, basis=BASIS, solver="ipopt")
+    ours = optid.fit(data, hammerstein_oe, na=0, nb=2, nk=1, basis=BASIS, solver="ipopt")
     theirs = optid.fit(data, "hammerstein_oe.exact", na=0, nb=2, nk=1, basis=BASIS)
     assert ours.solution.objective == pytest.approx(theirs.solution.objective, rel=1e-8)
 
@@ -86,17 +86,17 @@ def test_shape_constraints_agree_with_gauss_newton():
 
 def test_constraints_on_the_simulated_output_and_nonconvex_ones():
     data = plain()
-    free = optid.fit(data, shooting.exact, solver="ipopt", **ORDERS)
+    free = optid.fit(data, hammerstein_oe, solver="ipopt", **ORDERS)
     ceiling = 0.9 * float(np.max(free.values["x"]))
     rules = [lambda v: {"ceiling": v["x"] <= ceiling}, lambda v: {"pole": cp.multiply(v["a"][0], v["a"][0]) >= 1.6}]
-    fit = optid.fit(data, shooting.exact, solver="ipopt", constraints=rules, **ORDERS)
+    fit = optid.fit(data, hammerstein_oe, solver="ipopt", constraints=rules, **ORDERS)
     assert np.max(fit.model.simulate(data, x0="fit")) <= ceiling + 1e-2
     assert np.max(fit.values["x"]) <= ceiling + 1e-6 and fit.model.a[0] ** 2 >= 1.6 - 1e-6
     assert fit.solution.objective > free.solution.objective
 
 
 def test_start_satisfies_the_programme_and_judging_is_ours():
-    program = as_program(shooting.exact(plain((150, 100), gaps=0.1), **ORDERS))
+    program = as_program(hammerstein_oe(plain((150, 100), gaps=0.1), **ORDERS))
     program.assign(program.start)
     for group in program.constraints.values():
         for member in group:
@@ -107,15 +107,15 @@ def test_start_satisfies_the_programme_and_judging_is_ours():
 def test_units():
     data = plain()
     options = ORDERS | {"basis": "triangular:4"}
-    fit = optid.fit(data, shooting.exact, solver="ipopt", **options)
-    scaled = optid.fit(data.detrend().scale(), shooting.exact, solver="ipopt", **options)
+    fit = optid.fit(data, hammerstein_oe, solver="ipopt", **options)
+    scaled = optid.fit(data.detrend().scale(), hammerstein_oe, solver="ipopt", **options)
     assert scaled.model.theta() == pytest.approx(fit.model.theta(), rel=1e-4, abs=1e-5)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_small_and_large_units(factor):
     data = plain()
-    fit = optid.fit(Data(data.u, factor * data.y), shooting.exact, solver="ipopt", **ORDERS)
+    fit = optid.fit(Data(data.u, factor * data.y), hammerstein_oe, solver="ipopt", **ORDERS)
     reference = optid.fit(data, "hammerstein_oe.exact", **ORDERS)
     assert fit.solution.objective == pytest.approx(factor**2 * reference.solution.objective, rel=1e-6)
 
@@ -127,7 +127,7 @@ def test_small_and_large_units(factor):
 def test_measured_records(real_data, name, channels, orders):
     """Plants with poles near the unit circle, of which the equations alone would allow some outside."""
     data = optid.read(real_data / f"{name}.csv", inputs=channels[:1], outputs=channels[1:], dt=1.0).window(0, 800)
-    ours = quiet(data, shooting.exact, nk=1, solver="ipopt", **orders)
+    ours = quiet(data, hammerstein_oe, nk=1, solver="ipopt", **orders)
     theirs = quiet(data, "hammerstein_oe.exact", nk=1, **orders)
     assert ours.model.is_stable and ours.solution.status is Status.LOCAL
     assert ours.solution.objective == pytest.approx(theirs.solution.objective, rel=1e-6)
@@ -139,20 +139,20 @@ def test_poles_on_the_edge_are_held():
     y = np.zeros(80)
     for k in range(1, 80):
         y[k] = 1.03 * y[k - 1] + u[k - 1]
-    fit = quiet(Data(u, y), shooting.exact, na=1, nb=1, nk=1, basis="linear", solver="ipopt", raises=False)
+    fit = quiet(Data(u, y), hammerstein_oe, na=1, nb=1, nk=1, basis="linear", solver="ipopt", raises=False)
     assert fit.model.a[0] == pytest.approx(-1.0, abs=1e-5) and fit.model.is_stable
 
 
 def test_refusals():
     data = plain((200,))
     with pytest.raises(StructureError, match="30000 samples.*up to 20000.*hammerstein_oe.exact"):
-        quiet(Data(np.tile(data.u, (150, 1)), np.tile(data.y, (150, 1))), shooting.exact, **ORDERS)
-    refuses(StructureError, "is not convex and is taken by", quiet, data, shooting.exact, solver="clarabel", **ORDERS)
-    refuses(StructureError, "gauge=.*use one of norm", quiet, data, shooting.exact, gauge="none", **ORDERS)
-    refuses(StructureError, "one output", quiet, Data(data.u, np.hstack([data.y, data.y**2])), shooting.exact, **ORDERS)
-    refuses(StructureError, "na .the number of poles.", quiet, data, shooting.exact, **ORDERS | {"na": -1})
-    refuses(RankError, "samples for", quiet, Data(data.u[:10], data.y[:10]), shooting.exact, **ORDERS)
-    refuses(DataError, "'y'", lambda: quiet(Data(data.u, np.full((200, 1), np.nan)), shooting.exact, **ORDERS))
+        quiet(Data(np.tile(data.u, (150, 1)), np.tile(data.y, (150, 1))), hammerstein_oe, **ORDERS)
+    refuses(StructureError, "is not convex and is taken by", quiet, data, hammerstein_oe, solver="clarabel", **ORDERS)
+    refuses(StructureError, "gauge=.*use one of norm", quiet, data, hammerstein_oe, gauge="none", **ORDERS)
+    refuses(StructureError, "one output", quiet, Data(data.u, np.hstack([data.y, data.y**2])), hammerstein_oe, **ORDERS)
+    refuses(StructureError, "na .the number of poles.", quiet, data, hammerstein_oe, **ORDERS | {"na": -1})
+    refuses(RankError, "samples for", quiet, Data(data.u[:10], data.y[:10]), hammerstein_oe, **ORDERS)
+    refuses(DataError, "'y'", lambda: quiet(Data(data.u, np.full((200, 1), np.nan)), hammerstein_oe, **ORDERS))
     with pytest.raises(OptidError):
-        quiet(data, shooting.exact, solver="ipopt",
+        quiet(data, hammerstein_oe, solver="ipopt",
               constraints=[lambda v: {"up": v["a"][0] >= 1, "down": v["a"][0] <= -1}], **ORDERS)

@@ -18,6 +18,7 @@ from formulations.constraints.rule import Rule
 from formulations.state_space import hammerstein_ss as exact
 from formulations.state_space import ss as linear
 from optid.bases import BSpline, Linear, Polynomial, Triangular, UserFunctions
+from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, InfeasibleError, RankError, StructureError
 from optid.identify.prediction_error import state_errors
@@ -43,7 +44,7 @@ def problem(criterion, missing, fed, experiments=2, n=3, seed=0, basis=None, lat
     feedback = [(basis or Polynomial(3)).fitted(-3, 3), None] if fed else None
     expansion = expand(data, bases, feedback)
     unknowns = StateUnknowns(n, expansion, experiments, (True, False), criterion, True, latent, linear_output)
-    criterion = StateErrors(data, unknowns, np.array([[2.0, 0.3], [0.3, 0.5]]))
+    criterion = StateErrors(data, unknowns, np.array([[2.0, 0.3], [0.3, 0.5]]), Transform.identity(data.m, 2))
     return criterion, criterion.normalised(0.3 * rng.normal(size=unknowns.size))
 
 
@@ -139,7 +140,7 @@ def test_scipy_finds_no_better_point(criterion):
     _, data = system(seed=3, kind="innovation" if criterion == "prediction" else "output", samples=300, noise=0.2)
     fit = optid.fit(data, linear, nx=2, criterion=criterion, weighting="scale")
     unknowns = StateUnknowns(2, _expansion(data), 1, (True, True), criterion)
-    error = StateErrors(data, unknowns, np.diag(1 / data.y.var(axis=0)))
+    error = StateErrors(data, unknowns, np.diag(1 / data.y.var(axis=0)), Transform.identity(data.m, data.l))
     x = entered(error, fit.model)
     assert error.linearise(x).value == pytest.approx(fit.solution.objective, rel=1e-8)
     root = np.linalg.cholesky(error.weight).T

@@ -300,6 +300,12 @@ def asks_for_integrator(constraints: Sequence[Any]) -> bool:
     return any("integrator" in getattr(rule, "about", ()) for rule in constraints)
 
 
+def refuse_integrator(constraints: Sequence[Any], remedy: str) -> None:
+    """Refuse the constraint `integrator` with a remedy (`StructureError`)."""
+    if asks_for_integrator(constraints):
+        raise StructureError(remedy)
+
+
 @recorded
 def integrator() -> Rule:
     """A pole lies at 1, ``1 + a_1 + ... + a_na = 0``: the output ramps while the inputs are held.

@@ -17,8 +17,7 @@ from optid.data.record import Data
 from optid.data.stretches import interpolated, with_whole_inputs
 from optid.errors import RankError, StructureError
 from optid.identify.prediction_error.compressed_errors import CompressedStates
-from optid.identify.prediction_error.descent import Criterion
-from optid.identify.prediction_error.tangent_fit import Places
+from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.tangent import constraint_rows
 from optid.models.equations import Equations
 from optid.models.physical import PhysicalModel, Runs
@@ -44,6 +43,7 @@ class PhysicalUnknowns(Unknowns):
     experiments: int
     innovations = False
     latent = ()
+    free = ()
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -82,11 +82,6 @@ class PhysicalErrors(Criterion):
         """The order of the unknowns."""
         return PhysicalUnknowns(tuple(self.equations.parameters), len(self.equations.states), self.data.l,
                                 self.data.n_experiments)
-
-    @cached_property
-    def places(self) -> Places:
-        """Positions of the named variables among the unknowns."""
-        return Places.of(self)
 
     @cached_property
     def steps(self) -> int:
@@ -143,10 +138,15 @@ class PhysicalErrors(Criterion):
         states = x[unknowns.shared :].reshape(unknowns.experiments, unknowns.n)
         return x[: unknowns.shared] * self.usual[unknowns.n :], states * self.usual[: unknowns.n]
 
-    def model(self, x: Array) -> PhysicalModel:
-        """Return the model of the unknowns."""
+    @property
+    def units(self) -> Transform:
+        """Models have the units of the record."""
+        return Transform.identity(self.data.m, self.data.l)
+
+    def model(self, values: Values) -> PhysicalModel:
+        """Return the model of named values."""
         data, equations = self.data, self.equations
-        p, states = self.split(x)
+        p, states = self.split(self.variables.pack(values))
         mean = np.mean(np.vstack([e.u for e in data.experiments]), axis=0)
         return PhysicalModel(
             self.code, self.in_words(), tuple(equations.states), dict(zip(equations.parameters, p)), states[0],
@@ -307,7 +307,7 @@ class CompressedPhysical(CompressedStates):
     criterion: PhysicalErrors  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, errors: PhysicalErrors) -> None:
-        self.criterion, self.outward = errors, Transform.identity(errors.data.m, errors.data.l)
+        self.criterion = errors
 
     def settle(self, values: Values) -> None:
         """Linearise the errors at values of the unknowns; a run that diverges there is a `StructureError`."""
@@ -325,7 +325,7 @@ class CompressedPhysical(CompressedStates):
 
     def refuse_undetermined(self, problem: Problem, values: Values) -> None:
         """Refuse parameters that neither the record nor binding constraints determine (`RankError`)."""
-        equal, above, slack = constraint_rows(problem, values, tuple(self.places.names))
+        equal, above, slack = constraint_rows(problem, values, tuple(self.criterion.variables.names))
         rows = np.vstack([equal, above[slack <= BINDING * (1 + np.abs(slack).max(initial=0.0))]])
         matrix, errors = self.at.whole[0], self.criterion
         initial = [f"initial {name}" for name in errors.equations.states] * errors.unknowns.experiments

@@ -24,6 +24,11 @@ class Status(Enum):
     def __str__(self) -> str:
         return self.value
 
+    @property
+    def is_optimum(self) -> bool:
+        """Whether the point is an optimum, globally or locally."""
+        return self in (Status.OPTIMAL, Status.LOCAL)
+
 
 @dataclass(frozen=True)
 class Bound:

@@ -13,7 +13,8 @@ from scipy.linalg import schur
 
 from optid.arrays import Array
 from optid.errors import DataError
-from optid.identify.prediction_error.descent import Criterion, beside_poles
+from optid.identify.prediction_error.criterion import Criterion
+from optid.identify.prediction_error.descent import beside_poles
 from optid.models.roots import roots_of
 from optid.statistics.linearised import linearised
 

@@ -8,7 +8,6 @@ gives the sandwich form of the covariance (Ljung, System Identification, 1999, c
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +16,9 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.core.terms import Values
 from optid.data.channels import Transform
-from optid.identify.prediction_error.descent import Criterion
+from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.prediction_error.error_noise import ErrorNoise
 from optid.identify.prediction_error.state_errors import StateErrors
-from optid.identify.prediction_error.tangent_fit import Places
 from optid.program.compressed import Spread, degrees_of_freedom, white_spread
 from optid.program.units import energy_unit
 from optid.statistics.coloured import scattered
@@ -56,11 +54,6 @@ class CompressedErrors:
     at: Linearised  # these near the iterate
     reference: Array  # (n,) variables of the iterate, flattened: z
 
-    @cached_property
-    def places(self) -> Places:
-        """Positions of the variables in z."""
-        return Places.of(self.criterion)
-
     @property
     def energy(self) -> Array:
         """Sum of squares of the output about its mean, (1,)."""
@@ -94,7 +87,7 @@ class CompressedErrors:
 
     def lifted(self, values: Mapping[str, Array]) -> Array:
         """Return z."""
-        return self.places.pack(values)
+        return self.criterion.variables.pack(values)
 
     def one_step_fit(self, values: Mapping[str, Array]) -> Array | None:
         """Return the fit in % on the record: one step ahead an output-error model predicts what it simulates."""
@@ -161,12 +154,16 @@ class CompressedStates(CompressedErrors):
     """The compressed errors of a state-space model; see `CompressedErrors`."""
 
     criterion: StateErrors
-    outward: Transform  # from the units of the programme's models to those of the record
     fixed: bool = False  # whether the programme fixes by rows what changes no output
+
+    @property
+    def outward(self) -> Transform:
+        """From the units of the programme's models to those of the record."""
+        return self.criterion.units
 
     def settle(self, values: Values) -> None:
         """Linearise the errors again, at values of the unknowns."""
-        self.reference = self.places.pack(values)
+        self.reference = self.criterion.variables.pack(values)
         self.at = self.criterion.linearise(self.reference)
 
     @property
@@ -207,7 +204,7 @@ class CompressedStates(CompressedErrors):
     @property
     def scale(self) -> float:
         """What one unit of the covariance of the errors is in units of the objective."""
-        return energy_unit(self.outward)
+        return energy_unit(self.criterion.units)
 
     def spread(self, z: Array, moves: Array) -> Spread:
         """Return the scatter under the noise that the errors show at z: the factor holds directions of no effect."""

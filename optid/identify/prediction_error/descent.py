@@ -4,18 +4,15 @@ The scaling is that of Moré (1978); the damping follows the ratio of the gain r
 (Damping parameter in Marquardt's method, IMM-REP-1999-05, 1999): steady where steps are refused in turn.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.record import Data
-from optid.statistics.linearised import Linearised, Method
-from optid.statistics.unknowns import Unknowns
+from optid.identify.prediction_error.criterion import Criterion
+from optid.statistics.linearised import Linearised
 
 STATIONARY = 1e-12  # share of the sum of squares that a full step would still gain, below which a descent has arrived
 EXACT = 1e-24  # sum of squared errors, as a share of the energy of the record, that counts as zero
@@ -38,99 +35,6 @@ BETTER = 2.0  # times the errors' energy that a local optimum may have of that a
 ROUNDING = 1e-9  # relative difference of two sums of squares that were added up in different ways
 BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
           "constraint such as integrator (a pole at 1) or stable:0.999")
-
-
-class Criterion(ABC):
-    """A sum of squared errors in a vector x of unknowns, of which the last ones are initial states."""
-
-    data: Data  # the record
-    unknowns: Unknowns  # the order of x
-    gauge: str  # how the scale between mu and b is fixed
-    weight: Array  # (l, l) weight of the errors
-    unit: float = 1.0  # what one unit of the sum of squares is in units of the record
-    # whether the errors are nonlinear in the initial states, so that steps of these are damped, too
-    bends: bool = False
-
-    @property
-    def errors(self) -> str:
-        """What they are called."""
-        return "prediction errors" if self.unknowns.innovations else "simulation errors"
-
-    @property
-    def dynamics(self) -> str:
-        """Name of the part of x that has the poles: the matrix A, or the coefficients a of a polynomial."""
-        return "A" if "A" in self.unknowns.slices else "a"
-
-    @cached_property
-    def labels(self) -> list[str]:
-        """What the names of the courses of every experiment end in: "[1]", ..., nothing where there is only one."""
-        count = self.data.n_experiments
-        return [f"[{i}]" if count > 1 else "" for i in range(1, count + 1)]
-
-    # (E, l) what `levelled` subtracted from the outputs, where every experiment has constants of its own
-    shifts: Array | None = None
-
-    @cached_property
-    def energy(self) -> float:
-        """Weighted sum of squares of the outputs about their means, without the levels that were subtracted."""
-        return self._energy([e.y for e in self.data.experiments])
-
-    @cached_property
-    def energy_of_record(self) -> float:
-        """The same of the outputs with their levels."""
-        outputs, shifts = [e.y for e in self.data.experiments], self.shifts
-        return self._energy(outputs if shifts is None else [y + shift for y, shift in zip(outputs, shifts)])
-
-    def _energy(self, outputs: Sequence[Array]) -> float:
-        y = np.vstack(outputs)
-        y = np.nan_to_num(y - np.nanmean(y, axis=0))
-        return float(np.sum((y @ self.weight) * y))
-
-    @abstractmethod
-    def key(self, name: str, number: int) -> str:
-        """Name a quantity of a channel, such as "mu" of input 0."""
-
-    @abstractmethod
-    def linearise(self, x: Array, method: Method = "auto") -> Linearised:
-        """Return the errors near x, compressed by a method of `optid.statistics.linearised`."""
-
-    @abstractmethod
-    def rows(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
-        """Return a generator of the weighted rows [x0 | shared | error] near x of experiment i, zero without an error.
-
-        They are (T l, q + 1), the outputs of a sample one after the other, each block with the number of its errors.
-        """
-
-    @abstractmethod
-    def value(self, x: Array) -> float:
-        """Return the sum of squared errors at x, without sensitivities; infinite where a run leaves its range."""
-
-    @abstractmethod
-    def admissible(self, x: Array) -> bool:
-        """Whether the errors exist at x: its filters are stable."""
-
-    def confined(self, x: Array) -> Array:
-        """Return the nearest admissible point where that is one of parts that no constraint is about, else x."""
-        return x
-
-    def scale(self, x: Array, b: str) -> float:
-        """Return what a part b of x is divided by, and its mu multiplied with, to reach the gauge: its norm."""
-        return float(np.linalg.norm(x[self.unknowns.slices[b]]))
-
-    def gain_sign(self, x: Array, b: str) -> float:
-        """Return the sign that part b of x, and its mu, are given: here that of its largest entry."""
-        part = x[self.unknowns.slices[b]]
-        return -1.0 if part[np.argmax(np.abs(part))] < 0 else 1.0
-
-    def normalised(self, x: Array) -> Array:
-        """Return the same model in the gauge."""
-        x, at = np.array(x), self.unknowns.slices
-        for mu, b in self.unknowns.products:
-            if factor := self.scale(x, b):
-                x[at[mu]], x[at[b]] = x[at[mu]] * factor, x[at[b]] / factor
-            else:  # a channel without effect: any direction will do
-                x[at[mu]], x[at[b]] = 0.0, 1 / np.sqrt(x[at[b]].size)
-        return x
 
 
 @dataclass(frozen=True, eq=False)

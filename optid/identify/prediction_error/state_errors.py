@@ -6,7 +6,7 @@ run of the simulator (`optid.models.state_kernels`), and a chunk is reduced to a
 error of a missing output is left out, without a correction, and the model output is fed back.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -16,14 +16,16 @@ import scipy.sparse as sp
 
 from optid.arrays import Array
 from optid.bases import Basis, Linear
+from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.prediction_error.descent import Criterion
+from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.subspace.realisation import state_model
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models import state_simulation as simulation
 from optid.models.roots import spectral_radius
 from optid.models.state_signals import Stretch
+from optid.program.units import outer_bases
 from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.state_unknowns import SIMULATORS, StatePoint, StateUnknowns
 
@@ -43,6 +45,7 @@ class StateErrors(Criterion):
     data: Data  # the record
     unknowns: StateUnknowns  # their order, and the criterion
     weight: Array  # (l, l) weight of the errors
+    units: Transform  # from those of the models of points to those of the record
     limit: float = STABLE  # modulus below which the poles that carry the state must stay
     # constraints on poles that every iterate satisfies: model -> violation, "" for none
     checks: tuple[Callable[[Any], str], ...] = ()
@@ -59,6 +62,17 @@ class StateErrors(Criterion):
             word = {"nu": "mu feedback", "e": "b feedback"}[name]
             return word if x.l == 1 else f"{word}[{x.output_names[x.feedback[number].output]}]"
         return name if x.m == 1 else f"{name}[{x.input_names[number]}]"
+
+    def facts(self) -> dict[str, Any]:
+        """Return what constraints may ask besides named expressions: keyword arguments of a `View`."""
+        x = self.unknowns.expansion
+        return {"gauge": self.gauge, "channels": x.input_names, "outputs": x.output_names, "units": self.units,
+                "bases": dict(zip(x.input_names, outer_bases(x.inputs, self.units)))}
+
+    def model(self, values: Mapping[str, Array], constrained: bool = True) -> HammersteinSS:
+        """Return the model of named values, in the units of the problem; without constraints in its usual gauge."""
+        found = self.at(self.unknowns.unpack(self.variables.pack(values)))
+        return found.regauge("norm") if any(self.unknowns.free) and not constrained else found
 
     @property
     def bends(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]

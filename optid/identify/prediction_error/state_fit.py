@@ -9,7 +9,6 @@ import numpy as np
 
 from optid.arrays import Array, check_integer, one_of
 from optid.core.problem import Problem
-from optid.data.channels import Transform
 from optid.data.levels import levelled
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
@@ -29,8 +28,7 @@ from optid.program.units import energy_unit, in_units, inverse
 from optid.solving.solve import Evidence, Procedure
 from optid.statistics.state_unknowns import SIMULATORS
 
-# (name, errors, units from those of the errors to those of the record, point, constraints) -> the problem
-Pose = Callable[[str, StateErrors, Transform, Array, Sequence[Any]], Problem]
+Pose = Callable[[str, StateErrors, Array, Sequence[Any]], Problem]  # of name, errors, point and constraints
 WORDS = {"criterion": tuple(SIMULATORS), "stability": ("stable", "free"),
          "weighting": ("auto", "scale", "variance", "determinant")}
 
@@ -99,8 +97,8 @@ def fit_states(name: str, data: Data, nx: int | str, *, pose: Pose, subspace: Ca
 
 def _refined(pose: Pose, plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: Descent,
              figures: Mapping[str, Any]) -> Procedure:
-    problem = pose(plan.name, errors, plan.units, best.x, constraints)
-    fit = TangentFit(problem, errors, lambda at, z0: CompressedStates(errors, at, z0, plan.units))
+    problem = pose(plan.name, errors, best.x, constraints)
+    fit = TangentFit(problem, errors, partial(CompressedStates, errors))
     return (yield from refine(fit, best, figures, fit.signed(best.x)))
 
 

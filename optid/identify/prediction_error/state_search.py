@@ -219,7 +219,7 @@ def errors_and_starts(plan: Plan, nx: int, found: dict[str, HammersteinSS], crit
     # a similarity transformation removes nx² degrees of freedom
     enough_rows(outputs_present(data), "output samples", unknowns.size - nx**2, "states")
     variances = np.nanvar(np.vstack([e.y for e in data.experiments]), axis=0)
-    errors = StateErrors(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)),
+    errors = StateErrors(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)), plan.units,
                          STABLE if stability == "stable" else np.inf, checks, shifts)
     starts = {name: x for name, model in found.items() if (x := entered(errors, model)) is not None}
     if not starts:

@@ -3,83 +3,21 @@
 A formulation states the problem; `tangent_descent` takes the steps.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.core.judge import largest_excess
 from optid.core.problem import Problem
 from optid.core.program import Program, as_program
-from optid.core.terms import Squares, Values, flat
-from optid.identify.prediction_error.descent import Criterion
+from optid.core.terms import Squares, Values
+from optid.identify.prediction_error.criterion import Criterion, Places
 from optid.statistics.linearised import Linearised
-from optid.statistics.unknowns import Unknowns
 
 INSIDE = 1e-6  # relative violation up to which a point satisfies the constraints
-
-
-@dataclass(frozen=True, eq=False)
-class Places:
-    """Named variables, and where each stands in the vector of the unknowns of errors."""
-
-    criterion: Criterion  # the errors
-    names: Mapping[str, str]  # {variable: part of the vector}, in its order; "x0" is the initial states
-
-    @classmethod
-    def of(cls, criterion: Criterion) -> "Places":
-        """Name the parts by the keys of a criterion."""
-        found, unknowns = {}, criterion.unknowns
-        for part, shape in unknowns.shapes.items():
-            kind = part.rstrip("0123456789")
-            if np.prod(shape):
-                found[part if kind == part else criterion.key(kind, int(part[len(kind) :]))] = part
-        return cls(criterion, {**found, "x0": "x0"} if unknowns.memory else found)
-
-    @property
-    def unknowns(self) -> Unknowns:
-        """The order of the vector."""
-        return self.criterion.unknowns
-
-    def values(self, x: Array) -> dict[str, Array]:
-        """Name the parts of x; initial states are (n,), or (n, experiments)."""
-        unknowns, parts = self.unknowns, self.unknowns.parts(x)
-        states = x[unknowns.shared :].reshape(unknowns.experiments, unknowns.memory).T
-        parts["x0"] = states if unknowns.experiments > 1 else states[:, 0]
-        return {name: parts[part] for name, part in self.names.items()}
-
-    def pack(self, values: Mapping[str, Array]) -> Array:
-        """Return x of named values."""
-        return np.concatenate([np.ravel(values[name], order="F" if part == "x0" else "C")
-                               for name, part in self.names.items()]).astype(float)
-
-    def value(self, values: Values) -> float:
-        """Return the sum of squared errors at named values."""
-        return self.criterion.value(self.pack(values))
-
-    def squares(self, values: Values) -> Squares:
-        """Return the sum of squared errors near named values, the errors to first order."""
-        z0 = self.pack(values)
-        at = self.criterion.linearise(z0)
-        root, errors = at.whole
-        return Squares(root[:, self.columns], root @ z0 - errors, at.remainder, tuple(self.names))
-
-    def stacked(self, variables: Mapping[str, cp.Expression]) -> cp.Expression:
-        """Return the variables as the vector of the unknowns."""
-        return cp.hstack([variables[name] if variables[name].ndim == 1 else
-                          cp.vec(variables[name], order="F" if part == "x0" else "C")
-                          for name, part in self.names.items()])
-
-    @cached_property
-    def columns(self) -> NDArray[np.intp]:
-        """Where in the vector the entries of the variables are, one after another, each column by column."""
-        places = self.values(np.arange(self.unknowns.size, dtype=float))
-        return np.concatenate([flat(one) for one in places.values()]).astype(np.intp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,10 +62,10 @@ class TangentFit:
         """Return the largest relative violation of the constraints, or of those about some unknowns alone."""
         return largest_excess(self.problem, self.places.values(x), unknowns)
 
-    @cached_property
+    @property
     def places(self) -> Places:
         """The named unknowns in the order of their vector."""
-        return Places.of(self.criterion)
+        return self.criterion.variables
 
     def signed(self, x: Array) -> Array:
         """Return x with the signs of mu and b that the constraints ask for."""

@@ -1,6 +1,6 @@
 """The sum of squared errors of a transfer-function model, and the record it is taken from, in its own units."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -8,16 +8,16 @@ import numpy as np
 
 from optid.arrays import Array, check_integer
 from optid.bases import Linear, fitted_bases
-from optid.data.channels import Transform
+from optid.data.channels import Transform, model_meta
 from optid.data.levels import levelled
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.identify.arguments import Offset, check_offset, enough_rows, one_output, outputs_present, per_channel
-from optid.identify.prediction_error.descent import Criterion
-from optid.models import recursions, roots
+from optid.identify.prediction_error.criterion import Criterion
+from optid.models import HammersteinTF, Nonlinearity, recursions, roots
 from optid.models.gauges import gauge_factor, plant_sign
 from optid.models.layout import Layout
-from optid.program.units import energy_unit, in_units, inner_bases, own_units
+from optid.program.units import energy_unit, in_units, inner_bases, outer_bases, own_units
 from optid.statistics.blocks import check_lengths
 from optid.statistics.experiments import collect_by_experiment
 from optid.statistics.linearised import Linearised, Method
@@ -48,6 +48,33 @@ class TransferErrors(TransferPredictor, Criterion):
     def key(self, name: str, number: int) -> str:
         """Name a quantity of an input: plain with one input, ``name[input]`` with several."""
         return name if self.data.m == 1 else f"{name}[{self.data.inputs[number]}]"
+
+    def facts(self) -> dict[str, Any]:
+        """Return what constraints may ask besides named expressions: keyword arguments of a `View`."""
+        layout = self.unknowns.layout
+        return {"channels": layout.inputs, "gauge": self.gauge, "units": self.units,
+                "bases": dict(zip(layout.inputs, outer_bases(layout.bases, self.units)))}
+
+    def model(self, values: Mapping[str, Array], signed: bool = True) -> HammersteinTF:
+        """Return the model of named values in the units of the record: the plant, and C/D where noise is filtered.
+
+        The signs of f and B are those of the values; without `signed` f rises where the output rises.
+        """
+        layout, part = self.unknowns.layout, {name: np.asarray(value, dtype=float) for name, value in values.items()}
+        mus = [part.get(self.key("mu", c), np.ones(1)) for c in range(layout.m)]
+        a, levels = part.get("a", np.zeros(0)), None
+        if self.unknowns.levels:
+            levels = part["x0"].reshape(self.unknowns.memory, -1)[-1:].T
+            part["offset"] = levels.mean(axis=0)
+        model = HammersteinTF(
+            a=a, b=tuple(part[self.key("b", c)] for c in range(layout.m)),
+            nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(layout.bases, mus)), nk=layout.nk,
+            offset=part.get("offset", np.zeros(1)), levels=levels, gauge=self.gauge, c=part.get("c", np.zeros(0)),
+            d=part.get("d", np.zeros(0)) if self.unknowns.apart else None, **model_meta(self.data))
+        model = model if signed else model.turned(model.gain_signs)
+        if self.shifts is not None:
+            model = model.with_output_levels(self.shifts)
+        return model.with_transform(self.units)
 
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x."""
