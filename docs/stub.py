@@ -7,7 +7,7 @@ import inspect
 import types
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import optid
 from optid.identify.fitting import fit
@@ -30,6 +30,8 @@ def written(hint: Any, modules: set[str]) -> str:
         return "Any"
     if origin in (types.UnionType, Union):
         return " | ".join(written(one, modules) for one in arguments)
+    if origin is Literal:
+        return f"Literal[{', '.join(map(repr, arguments))}]"
     if isinstance(hint, list):
         return "[" + ", ".join(written(one, modules) for one in hint) + "]"
     if hint is ...:

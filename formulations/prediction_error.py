@@ -32,13 +32,12 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.constraints.poles import asks_for_integrator
-from optid.arrays import LARGEST_INTEGER, check_integer, one_of
 from optid.bases import Bases
 from optid.core.leaves import Product
 from optid.core.problem import Problem
 from optid.core.terms import Errors
 from optid.data.record import Data
-from optid.identify.gauges import FIXED
+from optid.identify.gauges import Gauge
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.identify.prediction_error.transfer_fit import fit_transfer
 from optid.solving.solve import Procedure
@@ -50,7 +49,7 @@ Orders = int | Sequence[int]
 
 @steps(lambda given: {"hammerstein_bj.exact": "QP" if given["constraints"] else "QP linear"})
 def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: Bases = "polynomial:3", nk: Orders = 0,
-                   constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool | str = True, starts: int = 4,
+                   constraints: Sequence[Any] = (), gauge: Gauge = "norm", offset: bool | str = True, starts: int = 4,
                    seed: int = 0) -> Procedure:
     """Minimise the innovations of a Hammerstein Box-Jenkins model.
 
@@ -78,8 +77,7 @@ def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: 
         RankError: too few samples for the unknowns, a basis function that no sample excites, or inputs that the record
             does not tell apart.
     """
-    one_of("gauge", gauge, FIXED)
-    return _procedure("hammerstein_bj.exact", data, na, nb, nk, basis, nc, check_integer(nd, "nd", 0),
+    return _procedure("hammerstein_bj.exact", data, na, nb, nk, basis, nc, nd,
                       constraints, gauge, offset, starts, seed)
 
 
@@ -91,20 +89,19 @@ def bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, nk: Orders = 0, con
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are
     the errors raised.
     """
-    return _procedure("bj.exact", data, na, nb, nk, "linear", nc, check_integer(nd, "nd", 0), constraints, None, offset,
+    return _procedure("bj.exact", data, na, nb, nk, "linear", nc, nd, constraints, None, offset,
                       starts, seed)
 
 
 @steps(lambda given: {"hammerstein_oe.exact": "QP" if given["constraints"] else "QP linear"})
 def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
-                   constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool | str = True, starts: int = 6,
+                   constraints: Sequence[Any] = (), gauge: Gauge = "norm", offset: bool | str = True, starts: int = 6,
                    seed: int = 0) -> Procedure:
     """Minimise the simulation error of a Hammerstein model.
 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are the
     errors raised.
     """
-    one_of("gauge", gauge, FIXED)
     return _procedure("hammerstein_oe.exact", data, na, nb, nk, basis, 0, 0, constraints, gauge, offset, starts, seed)
 
 
@@ -121,14 +118,13 @@ def oe(data: Data, *, na: int, nb: Orders, nk: Orders = 0, constraints: Sequence
 
 @steps(lambda given: {"hammerstein_armax.exact": "QP" if given["constraints"] else "QP linear"})
 def hammerstein_armax(data: Data, *, na: int, nb: Orders, nc: int, basis: Bases = "polynomial:3", nk: Orders = 0,
-                      constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool | str = True, starts: int = 3,
-                      seed: int = 0) -> Procedure:
+                      constraints: Sequence[Any] = (), gauge: Gauge = "norm", offset: bool | str = True,
+                      starts: int = 3, seed: int = 0) -> Procedure:
     """Minimise the innovations of a Hammerstein ARMAX model; the record is not cut where inputs are missing.
 
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``mu``, ``offset``. Arguments as in `hammerstein_bj`, as are the
     errors raised, except for that of a record without stretches.
     """
-    one_of("gauge", gauge, FIXED)
     return _procedure("hammerstein_armax.exact", data, na, nb, nk, basis, nc, None, constraints, gauge, offset, starts,
                       seed)
 
@@ -146,12 +142,9 @@ def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constrain
 
 def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
                constraints: Sequence[Any], gauge: str | None, offset: Any, starts: Any, seed: int) -> Procedure:
-    """Check the numbers, and fit."""
-    count = check_integer(starts, "starts")
-    check_integer(seed, "seed", 0, LARGEST_INTEGER)
     errors = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
     errors = replace(errors, integrates=asks_for_integrator(constraints))
-    return (yield from fit_transfer(errors, count, seed, lambda x: _problem(name, errors, x).subject_to(*constraints)))
+    return (yield from fit_transfer(errors, starts, seed, lambda x: _problem(name, errors, x).subject_to(*constraints)))
 
 
 def _problem(name: str, errors: TransferErrors, optimum: Array) -> Problem:

@@ -36,6 +36,7 @@ from optid.core.leaves import Product
 from optid.core.problem import Problem
 from optid.core.terms import Squares, Values
 from optid.data.record import Data
+from optid.identify.gauges import Gauge
 from optid.identify.prediction_error.latent_functions import latent_channels
 from optid.identify.simultaneous import Courses, TransferCourses, check_states, fit_equations, shoot
 from optid.identify.subspace.steps import subspace_steps
@@ -71,7 +72,7 @@ def _problem(name: str, courses: Courses, start: Values, constraints: Sequence[A
 
 @steps(lambda given: {"hammerstein_oe.shooting": "NLP"})
 def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
-                   constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True) -> Problem:
+                   constraints: Sequence[Any] = (), gauge: Gauge = "norm", offset: bool = True) -> Problem:
     """Minimise the simulation errors with the simulated outputs as variables.
 
     Named variables: ``Theta``, ``a``, ``b``, ``kappa``, ``mu``, ``offset``, ``w``, ``x``.

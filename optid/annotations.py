@@ -3,11 +3,11 @@
 import sys
 import types
 from collections.abc import Mapping, Sequence
-from typing import Any, Union, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 
-from optid.arrays import LARGEST_INTEGER, is_number, shown
+from optid.arrays import LARGEST_INTEGER, is_number, one_of, shown
 from optid.errors import StructureError
 
 PLAIN = bool | np.bool_ | int | float | complex | np.number | str | bytes | list | tuple | set | dict | None
@@ -26,10 +26,19 @@ def check_values(arguments: Mapping[str, Any], annotations: Mapping[str, Any]) -
             raise StructureError(f"{name}={shown(value)}: it must be {_described(kind)}.")
 
 
+def check_words(arguments: Mapping[str, Any], annotations: Mapping[str, Any]) -> None:
+    """Refuse a word that is none of those of its annotation, a `Literal` (`StructureError`)."""
+    for name, value in arguments.items():
+        if get_origin(kind := annotations.get(name)) is Literal:
+            one_of(name, value, get_args(kind))
+
+
 def _is_of(value: Any, kind: Any) -> bool:
     origin, parts = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):
         return any(_is_of(value, part) for part in parts)
+    if origin is Literal:
+        return isinstance(value, str) and value in parts
     if origin is Sequence:
         if isinstance(value, np.ndarray):
             return value.ndim == 1 and all(_is_of(one, parts[0]) for one in value)
@@ -55,6 +64,8 @@ def _described(kind: Any) -> str:
     """Return what an annotation admits, in words."""
     if get_origin(kind) in (Union, types.UnionType):
         return " or ".join(map(_described, get_args(kind)))
+    if get_origin(kind) is Literal:
+        return " or ".join(map(repr, get_args(kind)))
     if get_origin(kind) is Sequence:
         return "a sequence of such"
     return WORDS.get(kind) or getattr(kind, "__name__", str(kind))

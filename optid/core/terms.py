@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.arrays import Array
+from optid.errors import StructureError
 from optid.program.expressions import has_kinks, jacobians
 from optid.structures.rank_one import RankOne
 
@@ -164,9 +165,13 @@ class Inner:
 
 @dataclass(frozen=True, eq=False)
 class NuclearNorms:
-    """``sum of weight ‖leaf‖_*``: kinks where a leaf loses rank."""
+    """``sum of weight ‖leaf‖_*``: kinks where a leaf loses rank. A negative weight is a `StructureError`."""
 
     weights: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        if not all(0 <= one < np.inf for one in self.weights.values()):
+            raise StructureError("the weight of a nuclear norm must be a nonnegative number of no extreme size")
 
     def value(self, y: Values) -> float:
         """Return the value at values of the leaves."""

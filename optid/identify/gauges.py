@@ -1,14 +1,16 @@
 """The scale between mu and b, which is not identifiable: how the formulations fix it."""
 
+from typing import Literal
+
 import numpy as np
 
-from optid.models.gauges import GAUGES, gauge_factor
+from optid.models.gauges import gauge_factor
 
-FIXED = GAUGES[:-1]  # the gauges that fix the scale
+Gauge = Literal["norm", "gain", "b0"]  # those that fix the scale
 
 
 def in_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray, channel: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return mu (P,) and b (nb,) or (nb, l) of one input, the channel, scaled to satisfy a gauge of `FIXED`.
+    """Return mu (P,) and b (nb,) or (nb, l) of one input, the channel, scaled to satisfy a `Gauge`.
 
     The coefficients a of A are (na,) or (na, l, l). A quantity that is zero, and that the gauge sets to one, is a
     `StructureError`.

@@ -6,12 +6,15 @@ A formulation says with `steps` what its programmes will be; ``solver=`` is one 
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import wraps
 from typing import Any
 
+from optid.annotations import check_words
 from optid.backends.back_end import BackEnd
 from optid.backends.choice import back_ends, find
 from optid.core.program import Program
 from optid.errors import LookupFailed, SolverRefused, nearest
+from optid.registry import annotations
 
 Solver = str | BackEnd | Callable[..., Any]
 Declaration = Callable[[Mapping[str, Any]], Mapping[str, str]]
@@ -22,10 +25,16 @@ def steps(declare: Declaration) -> Callable[[Callable[..., Any]], Callable[..., 
 
     What they are is a class of programme and, where special methods use it, the word of their structure, as `optid
     solvers` lists them: "QP linear", "NLP rank-one", "SDP". The step whose objective is that of the fit comes first.
+    Words that the annotations of the function do not list are refused before it is called (`StructureError`).
     """
     def mark(function: Callable[..., Any]) -> Callable[..., Any]:
-        function.steps = declare  # type: ignore[attr-defined]
-        return function
+        @wraps(function)
+        def checked(data: Any, **arguments: Any) -> Any:
+            check_words(arguments, annotations(function))
+            return function(data, **arguments)
+
+        checked.steps = declare  # type: ignore[attr-defined]
+        return checked
     return mark
 
 

@@ -4,7 +4,7 @@
 ``Theta_c = mu_c vec(b_c)ᵀ``; one pass over the record leaves a triangular system of the size of z.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -21,12 +21,14 @@ from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.identify.arguments import Offset, check_offset, per_channel
+from optid.identify.gauges import Gauge, in_gauge
 from optid.models import HammersteinTF, Nonlinearity
 from optid.program.compressed import Spread, white_spread
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.statistics import ExperimentMeans, Layout, Statistics, accumulate, collect, collect_by_experiment
 from optid.statistics.experiments import OF_EXPERIMENTS, UNEQUAL, by_experiment, equal_levels, rows_factor
-from optid.structures.lifted_regression import lifted_problem, positions
+from optid.structures.bilinear import starts
+from optid.structures.lifted_regression import leading_pairs, lifted_problem, positions
 from optid.structures.rank_one import RankOne
 
 
@@ -160,6 +162,36 @@ class EquationError:
         if self.shifts is not None:
             model = model.with_output_levels(self.shifts)
         return model.with_transform(self.units)
+
+    def rank_one_start(self, gauge: Gauge) -> dict[str, np.ndarray]:
+        """Return ``a``, ``offset``, and ``mu`` and ``b`` of every input: the best start without constraints."""
+        if gauge == "gain" and self.layout.l > 1:
+            raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
+        core = self.problem.core
+        point = core.point(*starts(core, count=1)[0])
+        part = self.linear_part(point.w)
+        start = {name: part[name] for name in self.linear_zeros()}
+        pairs = self._in_gauge(gauge, zip(point.mus, point.bs), start)
+        for mu, b, pair in zip(self.keys("mu"), self.keys("b"), pairs):
+            start.update(zip((mu, b), pair))
+        return start
+
+    def factored_model(self, gauge: Gauge, values: Mapping[str, np.ndarray], *, signed: bool = False) -> HammersteinTF:
+        """Return the model of ``mu`` and ``b``; `signed` keeps their signs, else f rises where the output rises."""
+        return self.model(values, [values[name] for name in self.keys("mu")], [values[name] for name in self.keys("b")],
+                          gauge=gauge, flip=gauge == "norm" and not signed)
+
+    def nearest_model(self, gauge: Gauge, whitened: bool, values: Mapping[str, np.ndarray]) -> HammersteinTF:
+        """Return the model of the leading singular pair of every Theta, in the metric of the errors or a plain one."""
+        pairs = leading_pairs(self.problem.core, self.matrices(values), whitened)
+        mus, bs = zip(*self._in_gauge(gauge, pairs, values))
+        return self.model(values, mus, bs, gauge=gauge, flip=gauge == "norm")
+
+    def _in_gauge(self, gauge: Gauge, pairs: Iterable[tuple[np.ndarray, np.ndarray]], values: Mapping[str, np.ndarray]
+                  ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return mu and b, as flat as the factors of a matrix, in the gauge."""
+        return [in_gauge(gauge, mu, b.reshape(self.b_shape(c), order="F"), self.past(values), channel)
+                for c, ((mu, b), channel) in enumerate(zip(pairs, self.layout.inputs))]
 
     def past(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the coefficients of A as models have them, (na,) or (na, l, l), from the variable ``a``, if any."""

@@ -196,7 +196,8 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
     if states:
         _check_inputs(record, layout, constants == "each")
     unknowns = TransferUnknowns(layout, record.n_experiments, (gauge is not None,) * layout.m, constants is True,
-                                check_integer(nc, "nc", 0), nd, constants == "each")
+                                check_integer(nc, "nc", 0), None if nd is None else check_integer(nd, "nd", 0),
+                                constants == "each")
     if states:
         enough_rows(outputs_present(record), "output samples", replace(unknowns, nc=0, nd=0).size, "lags")
     return TransferErrors(record, unknowns, gauge or "none", units,

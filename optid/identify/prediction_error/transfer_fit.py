@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-from optid.arrays import Array
+from optid.arrays import LARGEST_INTEGER, Array, check_integer
 from optid.core.problem import Problem
 from optid.identify.arguments import enough_rows
 from optid.identify.prediction_error.compressed_errors import CompressedErrors
@@ -23,7 +23,13 @@ def fit_transfer(errors: TransferErrors, starts: int, seed: int, pose: Callable[
         starts: number of starts.
         seed: of the random ones.
         pose: states the problem of the fit from the optimum, whose values have usual sizes.
+
+    Raises:
+        StructureError: numbers that are none.
+        RankError: too few samples for the unknowns.
     """
+    check_integer(starts, "starts")
+    check_integer(seed, "seed", 0, LARGEST_INTEGER)
     free = errors if errors.gauge == "none" else replace(errors, gauge="norm")
     best, others, figures = search(free, lambda part: starts_of(part, starts, seed))
     enough_rows(best.at.rows, errors.errors, errors.unknowns.size, "lags")

@@ -16,12 +16,11 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.sparse as sp
 
-from optid.arrays import Array, one_of
+from optid.arrays import Array
 from optid.core.leaves import Product
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import check_offset
-from optid.identify.gauges import FIXED
 from optid.identify.prediction_error.search import arx_start, iterated
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.identify.simultaneous.courses import Courses, Expressions, Formula, Reading, check_size
@@ -41,7 +40,6 @@ class TransferCourses(Courses):
     @classmethod
     def of(cls, data: Data, orders: tuple[Any, Any, Any], basis: Any, gauge: str, offset: Any) -> "TransferCourses":
         """Check the arguments of a fit; orders are na, nb and nk. Errors as of `transfer_errors`, a long record."""
-        one_of("gauge", gauge, FIXED)
         if check_offset(offset, data) == "each":
             raise StructureError("this programme has one constant for all experiments; 'hammerstein_oe.exact' takes "
                                  "offset='each'")
