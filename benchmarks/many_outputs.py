@@ -3,10 +3,10 @@
     python benchmarks/many_outputs.py [--outputs 28] [--orders 20 24 28] [--samples 3000]
 
 First the step ``min ‖up A - down‖`` with stable poles, for observability matrices of so many outputs with some poles
-outside the unit circle: the deflated step of `formulations.shift` against one programme in P and Q. Printed are CPU
-seconds, peak memory (of a process for each), and the residual above the least-squares residual, relative to it. Then
-fits with ``nx="auto"`` of simulated records with so many outputs: seven states and white noise, and with outputs that
-drift and oscillate besides, which takes many states.
+outside the unit circle: the deflated step of `optid.identify.subspace.shift` against one programme in P and Q. Printed
+are CPU seconds, peak memory (of a process for each), and the residual above the least-squares residual, relative to it.
+Then fits with ``nx="auto"`` of simulated records with so many outputs: seven states and white noise, and with outputs
+that drift and oscillate besides, which takes many states.
 """
 
 import argparse
@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-import formulations.shift
 import optid
 import optid.identify.subspace.shift
 from formulations.constraints.poles import stable
+from formulations.hammerstein_ss import SUBSPACE
 from optid.errors import DataWarning
 from optid.solving.solve import run
 
@@ -60,7 +60,9 @@ def step(n: int, outputs: int, whole: bool) -> str:
     gamma = observability(n, outputs)
     if whole:
         optid.identify.subspace.shift.LARGEST = n
-    shift = run(formulations.shift.constrained_shift(gamma[:-outputs], gamma[outputs:], [stable(0.999)])).model
+    programmes = SUBSPACE.shift, SUBSPACE.centre
+    up, down = gamma[:-outputs], gamma[outputs:]
+    shift = run(optid.identify.subspace.shift.constrained_shift(up, down, [stable(0.999)], programmes)).model
     return f"excess {shift.suboptimality / shift.bound:.3e}"
 
 

@@ -2,9 +2,26 @@
 
     x(k+1) = A x + B f(u) + E g(y) + w,    y(k) = C x + D f(u) + d + v
 
-Three methods, each a procedure of the same steps: (A, C) from projections of block Hankel matrices, constraints on the
-poles there; then (x0, B, D, E, d) as one least-squares programme with the constraints on coefficients, rank one per
-channel and certified; then the innovation form from the residuals.
+Three methods, each a procedure of the same steps (`optid.identify.subspace.procedure`): the observability matrix Gamma
+from projections of block Hankel matrices; (A, C) from its shift invariance, with the constraints on poles ("shift",
+"shift with fixed P", "centre"); then (x0, B, D, E, d) as least squares with the constraints on coefficients ("split").
+
+    min over P, Q:    ‖Gamma_up Q - Gamma_dn P‖      A = Q P^-1     (the fit weighted by P: Lacy and Bernstein 2003)
+    min over A:       ‖Gamma_up A - Gamma_dn‖        P given
+    max over P:       the margin of A in the inequalities
+    min over x0, ...: ‖R [x0; offset; vec Theta_1; ...] - s‖²,    Theta_i = mu_i [B_i; D_i]ᵀ
+
+P is definite with trace n, and any `Rule` about poles that is a linear matrix inequality in P and Q = A P takes part
+(Miller and de Callafon 2013). R and s are the record, compressed. The last step is either
+
+* factored: every channel is rank one; certified by the machinery of rank-one blocks. Named variables: ``x0``,
+  ``offset``, ``mu``, ``b`` (= [B_i; D_i]) and, for an output that is fed back, ``mu feedback``, ``b feedback``;
+* or lumped: ``Theta_i`` as it comes, convex; the factors are split off afterwards in the metric of the least squares.
+  Named variables: ``x0``, ``offset``, ``Theta``, ``Theta feedback``. Linear channels alone always take this form.
+
+With several inputs the per-channel names carry the input, as in ``mu[valve]``. Constraints may use in either form
+``Theta`` (P, n + l), the lumped ``Bu`` (n, p), ``Du`` (l, p) and ``Ez`` (n, q); where every channel is linear ``B``
+(n, m) and ``D`` (l, m) too. ``reference`` of the view holds A and C.
 
 * `sid`: past inputs and outputs as instruments (MOESP; Verhaegen and Dewilde 1992), for open loop.
 * `sivid`: instrumental variables with nonlinear feedback, singular regressors by pseudo-inverse (Luo and
@@ -13,26 +30,97 @@ channel and certified; then the innovation form from the residuals.
   keeps the regressors regular and the estimate consistent under coloured noise.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
-from formulations.subspace_procedure import identified
-from optid.arrays import check_integer, one_of
-from optid.bases import Bases, FeedbackBases
+import cvxpy as cp
+import numpy as np
+from cvxpy.constraints.psd import PSD
+
+from formulations.constraints.poles import stable
+from formulations.constraints.rule import Rule
+from optid.bases import Bases
+from optid.core.leaves import Product
+from optid.core.problem import Problem
+from optid.core.terms import Inner, Length, Squares
 from optid.data.record import Data
-from optid.errors import StructureError
-from optid.identify.subspace.plan import in_record_units, planned
+from optid.identify.subspace.procedure import SubspaceSteps
+from optid.identify.subspace.realisation import Realisation
+from optid.identify.subspace.shift import ShiftStep
 from optid.identify.subspace.steps import subspace_steps
 from optid.solving.solve import Procedure
 
-NOISES = ("white", "coloured")
+DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm of P^-1
+Noise = Literal["white", "coloured"]
+Feedback = Bases | None | Sequence[Bases | None]  # one basis for all outputs, or one per output
+
+
+def _shift(step: ShiftStep, rules: Sequence[Rule], given: tuple[np.ndarray, np.ndarray] | None = None) -> Problem:
+    """Return min ‖residual‖ under rules: in P and Q, weighted by P; with P and a start for A given, in A alone.
+
+    The model is A. The norm rather than its square: where a plant obeys almost exactly, the square would vanish in the
+    tolerance.
+    """
+    n = len(step.basis)
+    common: dict[str, Any] = {"model": step.recover, "facts": {"reference": {"A": step.free}}, "scale": step.size,
+                              "energy": step.size}
+    if given is None:
+        contracted = step.free * min(1.0, 0.5 / max(np.max(np.abs(np.linalg.eigvals(step.free))), 1e-12))
+        root = np.hstack([-np.kron(step.change.T, step.low), np.kron(step.change.T, step.top)])
+        return Problem(
+            "shift", {"P": np.eye(n), "Q": contracted},
+            (Length(root, np.zeros(len(root)), ("P", "Q")),),  # ‖(top Q - low P) change‖
+            restrictions=(_normalised,), builders=tuple(rules), symmetric=frozenset({"P"}), **common)
+    p = (given[0] + given[0].T) / 2
+    target = np.ravel(step.low @ step.change, order="F")
+    return Problem(
+        "shift with fixed P", {"A": step.inner(given[1])},
+        (Length(np.kron(step.change.T, step.top), target, ("A",)),),  # ‖(top A - low) change‖
+        further=lambda variables, _: {"P": cp.Constant(p), "Q": variables["A"] @ p, "A": None},
+        builders=tuple(rules), **common)
+
+
+def _centre(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Problem:
+    """Return the problem for the P that leaves a given A the largest margin in the matrix inequalities."""
+    inner = step.inner(a)
+
+    def ease(view: Any) -> dict[str, list[Any]]:
+        # the rules hold at A already: here they are not the user's, so that their prices stay those of the fit
+        return {"margin": [one.args[0] - view["margin"] * np.eye(one.args[0].shape[0]) >> 0
+                           if isinstance(one, PSD) else one for rule in rules for one in rule.members(view)]}
+
+    return Problem(
+        "centre", {"P": np.eye(len(a)), "margin": np.zeros(())}, (Inner({"margin": np.array(-1.0)}),),
+        further=lambda variables, _: {"Q": inner @ variables["P"]}, facts={"reference": {"A": step.free}},
+        restrictions=(_normalised, ease), symmetric=frozenset({"P"}))
+
+
+def _normalised(view: Any) -> dict[str, list[Any]]:
+    p = view["P"]
+    return {"positive": [p - DEFINITE * np.eye(p.shape[0]) >> 0], "trace": [cp.trace(p) == p.shape[0]]}
+
+
+def _split(step: Realisation) -> Problem:
+    """Return the least squares for given (A, C), ``‖R [x0; offset; vec Theta_1; ...] - s‖²``."""
+    thetas = tuple(theta for _, _, theta in step.names)
+
+    def further(variables: Mapping[str, Any], _: object) -> dict[str, Any]:
+        return step.expressions([variables[theta] for theta in thetas])
+
+    return Problem(
+        "split", step.start(), (Squares.of(step.problem, (*step.linear, *thetas)),),
+        tuple(Product(mu, b) for mu, b, _ in step.names) if step.factored else (),
+        step.model, step.facts(), further, **step.common())
+
+
+SUBSPACE = SubspaceSteps(_shift, _centre, _split, stable)
 
 
 @subspace_steps()
 def sid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",
-        noise: str = "white", weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
-        observer: str = "auto", split: str = "exact", stability: str = "auto",
-        constraints: Sequence[Any] = ()) -> Procedure:
+        noise: Noise = "white", weighting: str = "moesp", offset: bool = True,
+        feedthrough: bool | Sequence[bool] = True, observer: str = "auto", split: str = "exact",
+        stability: str = "auto", constraints: Sequence[Any] = ()) -> Procedure:
     """Identify an open-loop system from projections on past inputs and outputs.
 
     Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
@@ -55,25 +143,23 @@ def sid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, ba
             "auto" the first unless A is unstable.
         split: "exact" keeps every channel rank one in that step (certified), "lumped" splits afterwards (convex).
         stability: "auto" brings poles of an unstable estimate to modulus 0.999, "free" leaves them.
-        constraints: rules about poles and about coefficients; variables as in `formulations.subspace_procedure`.
+        constraints: rules about poles and about coefficients; variables as above.
 
     Raises:
         StructureError: words or orders that do not fit.
         RankError: the record does not determine the model; the message names the channel.
         DataError: a channel that is constant.
     """
-    one_of("noise", noise, NOISES)
-    plan = planned("hammerstein_ss.sid", data, nx=nx, block_rows=block_rows, basis=basis,
-                   instruments="inputs+past" if noise == "white" else "inputs", weighting=weighting, offset=offset,
-                   feedthrough=feedthrough, observer=observer, split=split, stability=stability,
-                   constraints=tuple(constraints))
-    return in_record_units(identified(plan), plan)
+    return SUBSPACE.fit(
+        "hammerstein_ss.sid", data, nx=nx, block_rows=block_rows, basis=basis,
+        instruments="inputs+past" if noise == "white" else "inputs", weighting=weighting, offset=offset,
+        feedthrough=feedthrough, observer=observer, split=split, stability=stability, constraints=tuple(constraints))
 
 
 @subspace_steps()
 def sivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
-          feedback_basis: FeedbackBases = None, instruments: str = "past", form: str = "projection",
-          tolerance: float = 0.05, weighting: str = "moesp", offset: bool = True,
+          feedback_basis: Feedback = None, instruments: Literal["past", "inputs", "inputs+past"] = "past",
+          form: str = "projection", tolerance: float = 0.05, weighting: str = "moesp", offset: bool = True,
           feedthrough: bool | Sequence[bool] = True, observer: str = "auto", split: str = "exact",
           stability: str = "auto", constraints: Sequence[Any] = ()) -> Procedure:
     """Identify a system with nonlinear feedback by instrumental variables, singular directions left out.
@@ -96,19 +182,15 @@ def sivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, 
     Warns:
         DataWarning: the feedback basis is nearly linear in y.
     """
-    one_of("instruments", instruments, ("past", "inputs", "inputs+past"))
-    if not 0 <= tolerance < 1:
-        raise StructureError(f"tolerance={tolerance!r}: it must be a number in [0, 1).")
-    plan = planned("hammerstein_ss.sivid", data, nx=nx, block_rows=block_rows, basis=basis,
-                   feedback_basis=feedback_basis, instruments=instruments, form=form, tolerance=max(tolerance, 1e-10),
-                   weighting=weighting, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
-                   stability=stability, constraints=tuple(constraints))
-    return in_record_units(identified(plan), plan)
+    return SUBSPACE.fit(
+        "hammerstein_ss.sivid", data, nx=nx, block_rows=block_rows, basis=basis, feedback_basis=feedback_basis,
+        instruments=instruments, form=form, tolerance=tolerance, weighting=weighting, offset=offset,
+        feedthrough=feedthrough, observer=observer, split=split, stability=stability, constraints=tuple(constraints))
 
 
 @subspace_steps()
 def asivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
-           feedback_basis: FeedbackBases = None, noise: str = "coloured", iterations: int = 2, form: str = "projection",
+           feedback_basis: Feedback = None, noise: Noise = "coloured", iterations: int = 2, form: str = "projection",
            weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
            observer: str = "auto", split: str = "exact", stability: str = "auto",
            constraints: Sequence[Any] = ()) -> Procedure:
@@ -128,11 +210,9 @@ def asivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None,
     Warns:
         DataWarning: the feedback basis is nearly linear in y; the simulated feedback explains little of the measured.
     """
-    one_of("noise", noise, NOISES)
-    check_integer(iterations, "iterations", 0)
     kind = "simulated" if iterations else "inputs"
-    plan = planned("hammerstein_ss.asivid", data, nx=nx, block_rows=block_rows, basis=basis,
-                   feedback_basis=feedback_basis, instruments=kind + ("+past" if noise == "white" else ""), form=form,
-                   iterations=int(iterations), weighting=weighting, offset=offset, feedthrough=feedthrough,
-                   observer=observer, split=split, stability=stability, constraints=tuple(constraints))
-    return in_record_units(identified(plan), plan)
+    return SUBSPACE.fit(
+        "hammerstein_ss.asivid", data, nx=nx, block_rows=block_rows, basis=basis, feedback_basis=feedback_basis,
+        instruments=kind + ("+past" if noise == "white" else ""), form=form, iterations=iterations,
+        weighting=weighting, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
+        stability=stability, constraints=tuple(constraints))

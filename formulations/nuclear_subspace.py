@@ -16,34 +16,26 @@ off the matrix; everything else is done by the steps of the other subspace metho
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from formulations.subspace_procedure import identified
-from optid.arrays import LARGEST, one_of, shown
-from optid.bases import Bases, FeedbackBases
+from formulations.hammerstein_ss import SUBSPACE, Feedback
+from optid.bases import Bases
 from optid.core.low_rank import LowRank
 from optid.core.problem import Problem
 from optid.data.record import Data
-from optid.errors import StructureError
-from optid.identify.subspace.low_rank import Structured, choose_weight, structure
-from optid.identify.subspace.plan import Plan, in_record_units, planned
+from optid.identify.subspace.low_rank import Structured
+from optid.identify.subspace.low_rank_fit import fit_low_rank
 from optid.identify.subspace.steps import subspace_steps
-from optid.program.solution import Solution, Status
-from optid.program.units import energy_unit
-from optid.solving.solve import Evidence, Procedure
-
-FORMS = ("predictor", "projection", "instruments")
-# weights tried by default, each the inverse of a noise variance relative to the variance of the outputs
-WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))
+from optid.solving.solve import Procedure
 
 
 @subspace_steps({"low rank": "SDP nuclear"})
 def nuclear(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",
-            feedback_basis: FeedbackBases = None, form: str = "predictor",
+            feedback_basis: Feedback = None,
+            form: Literal["predictor", "projection", "instruments"] = "predictor",
             weight: float | str | Sequence[float] = "auto", noise: float | None = None, hold_out: float = 0.3,
             offset: bool = True, feedthrough: bool | Sequence[bool] = True, observer: str = "auto",
             split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()) -> Procedure:
@@ -69,61 +61,10 @@ def nuclear(data: Data, *, nx: int | str = "auto", block_rows: int | None = None
         RankError: the record does not determine the model.
         DataError: a channel that is constant.
     """
-    one_of("form", form, FORMS)
-    if not 0 < hold_out < 1:
-        raise StructureError(f"hold_out={hold_out!r}: it must be a fraction in (0, 1)")
-    plan = planned("subspace.nuclear", data, nx=nx, block_rows=block_rows, basis=basis, feedback_basis=feedback_basis,
-                   instruments=form, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
-                   stability=stability, constraints=tuple(constraints))
-    weights = _weights(weight, noise)
-    return in_record_units(_procedure(plan, weights, noise, hold_out), plan)
-
-
-def _weights(weight: float | str | Sequence[float], noise: float | None) -> tuple[float, ...]:
-    if noise is not None:
-        if not 1 / LARGEST <= noise <= LARGEST or weight != "auto":
-            raise StructureError(f"noise={shown(noise)} is a positive standard deviation that takes the place of "
-                                 "weight=")
-        return (1.0,)
-    if isinstance(weight, str):
-        one_of("weight", weight, ("auto",))
-        return WEIGHTS
-    found = tuple(float(w) for w in np.atleast_1d(np.asarray(weight, dtype=float)))
-    if not found or not all(0 < w < np.inf for w in found):
-        raise StructureError(f"weight={weight!r}: give a positive number, several, or 'auto'")
-    return found
-
-
-def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold_out: float) -> Procedure:
-    trials, weight = {}, weights[0]
-    if len(weights) > 1:
-        weight, nx, trials = yield from choose_weight(plan, weights, hold_out, partial(low_rank, weight=1.0))
-        plan = replace(plan, nx=nx)
-    structured = structure(plan)
-    if noise is not None:
-        weight = float(np.mean(structured.scale)) ** 2 / noise**2 * energy_unit(plan.units)
-    solution: Solution = yield low_rank(structured, structured.penalty(weight))
-    if not solution.has_point:
-        return Evidence.pointless(solution.status, solution.reason)
-    _, sizes = parts = structured.decomposed(solution.values)
-    rank, nx = structured.rank(sizes), plan.order or structured.order(sizes)
-    if nx > rank:
-        return Evidence.pointless(Status.FAILED, f"order {nx}, but the low-rank matrix has rank {rank} at this weight: "
-                                                 "use a larger weight or a smaller order")
-    figures = {"order": nx, "block rows": structured.problem.rows, "form": plan.instruments, "singular values": sizes,
-               **trials, "weight": weight, "lambda": structured.penalty(weight), "rank": rank,
-               "objective of the convex programme": solution.objective,
-               "its dual bound": -np.inf if solution.bound is None else solution.bound.value,
-               "its relative gap": solution.gap,
-               "missing outputs estimated": int(np.sum(~structured.problem.known))}
-    found = replace(structured.observability(solution.values, parts, nx), figures=figures)
-    evidence = yield from identified(plan, found)
-    if evidence.model is None:
-        return evidence
-    evidence = replace(evidence, main="low rank", objective=solution.objective, bound=solution.bound or evidence.bound)
-    if solution.status in (Status.INACCURATE, Status.LIMIT) and evidence.status in (Status.LOCAL, Status.OPTIMAL):
-        evidence = replace(evidence, status=solution.status, reason=f"nuclear-norm programme: {solution.reason}")
-    return evidence
+    return fit_low_rank(
+        low_rank, SUBSPACE, data, weight, noise, hold_out, nx=nx, block_rows=block_rows, basis=basis,
+        feedback_basis=feedback_basis, instruments=form, offset=offset, feedthrough=feedthrough, observer=observer,
+        split=split, stability=stability, constraints=tuple(constraints))
 
 
 def low_rank(structured: Structured, weight: float) -> Problem:

@@ -31,7 +31,7 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.constraints.poles import NO_EQUATION, refuse_integrator
-from formulations.subspace_procedure import identified
+from formulations.hammerstein_ss import SUBSPACE
 from optid.bases import Bases
 from optid.core.leaves import Leaf, Product
 from optid.core.problem import Problem
@@ -147,4 +147,4 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, constraints: Sequen
                     **settings: Any) -> Procedure:
     """Fit a model in the units of the samples, and return it in those of the record; see `fit_states`."""
     refuse_integrator(constraints, NO_EQUATION)
-    return fit_states(name, data, nx, constraints=constraints, pose=pose, subspace=identified, **settings)
+    return fit_states(name, data, nx, constraints=constraints, pose=pose, subspace=SUBSPACE, **settings)

@@ -90,7 +90,7 @@ def test_step_is_least_squares_on_the_recursion(gain, feedback, offset, monkeypa
     expansion = expansion_of(records, feedback)
     form = ObserverForm(A, C, observer_gain(A, C, 1.0) if gain else np.zeros((2, 2)), expansion, 2,
                         (True, False), offset, np.array([1.0, 3.0]))
-    step = observer_problem(records, form)
+    step = observer_problem(records, form, None)
     parts = [columns(form, record, e) for e, record in enumerate(records)]
     phi = np.concatenate([p.reshape(-1, form.size) for p, _ in parts])
     y = np.concatenate([t.ravel() for _, t in parts])
@@ -113,9 +113,9 @@ def test_many_rows_enter_by_their_gram_matrix_unless_digits_are_lost(monkeypatch
         z = np.random.default_rng(7).normal(size=form.size)
         for e, record in enumerate(records):
             record[:, 2:4] = simulated(form, record, z, z[2 * e : 2 * e + 2])
-    step = observer_problem(records, form)
+    step = observer_problem(records, form, None)
     monkeypatch.setattr("optid.identify.subspace.regressors.MANY", np.inf)
-    stacked = observer_problem(records, form)
+    stacked = observer_problem(records, form, None)
     scale = np.sqrt(np.outer(np.diag(gram(stacked)), np.diag(gram(stacked))))
     np.testing.assert_allclose(gram(step) / scale, gram(stacked) / scale, atol=1e-11)
     np.testing.assert_allclose(step.least_squares(), stacked.least_squares(), atol=1e-10)
@@ -129,7 +129,7 @@ def test_missing_outputs_without_feedback_leave_the_state_alone():
     expansion = expansion_of(records, False)
     records[0][20:25, 2] = np.nan
     form = ObserverForm(A, C, np.zeros((2, 2)), expansion, 1, (True, True), True, np.ones(2))
-    step = observer_problem(records, form)
+    step = observer_problem(records, form, None)
     phi, y = columns(form, records[0], 0)
     present = ~np.isnan(y)
     np.testing.assert_allclose(gram(step), phi[present].T @ phi[present], atol=1e-9)
@@ -141,7 +141,7 @@ def test_gaps_restart_the_state_and_eliminate_it():
     expansion = expansion_of(records)
     records[0][30, 0] = np.nan
     form = ObserverForm(A, C, np.zeros((2, 2)), expansion, 1, (True, True), True, np.ones(2))
-    step = observer_problem(records, form)
+    step = observer_problem(records, form, None)
     first, second = records[0][:30], records[0][31:]
     two = ObserverForm(A, C, np.zeros((2, 2)), expansion, 2, (True, True), True, np.ones(2))
     parts = [columns(two, part, e) for e, part in enumerate((first, second))]
@@ -155,9 +155,9 @@ def test_an_experiment_may_begin_with_a_gap():
     records = records_of(np.random.default_rng(2), [60, 50])
     expansion = expansion_of(records)
     form = ObserverForm(A, C, np.zeros((2, 2)), expansion, 2, (True, True), True, np.ones(2))
-    expected = observer_problem([records[0], records[1][3:]], form).least_squares()
+    expected = observer_problem([records[0], records[1][3:]], form, None).least_squares()
     records[1][:3, 1] = np.nan
-    np.testing.assert_allclose(observer_problem(records, form).least_squares(), expected, atol=1e-10)
+    np.testing.assert_allclose(observer_problem(records, form, None).least_squares(), expected, atol=1e-10)
 
 
 def test_instruments_are_two_stage_least_squares():
@@ -165,7 +165,7 @@ def test_instruments_are_two_stage_least_squares():
     records = [np.hstack([record, rng.uniform(-1, 1, (len(record), 2))]) for record in records_of(rng, [90, 70])]
     expansion = expansion_of(records).with_simulated()
     form = ObserverForm(A, C, np.zeros((2, 2)), expansion, 2, (True, True), True, np.ones(2), instrumented=True)
-    step = observer_problem(records, form)
+    step = observer_problem(records, form, None)
     parts = [columns(form, record, e) for e, record in enumerate(records)]
     phi = np.concatenate([p.reshape(-1, form.size) for p, _ in parts])
     y = np.concatenate([t.ravel() for _, t in parts])
@@ -182,9 +182,9 @@ def test_what_the_record_does_not_determine_is_named():
     records[0][:, 1] = 0.0
     form = ObserverForm(A, C, np.zeros((2, 2)), expansion, 1, (True, True), True, np.ones(2))
     with pytest.raises(RankError, match="function 1 of pump"):
-        observer_problem(records, form).least_squares()
+        observer_problem(records, form, None).least_squares()
     with pytest.raises(RankError, match="equations for"):
-        observer_problem([records[0][:6]], form)
+        observer_problem([records[0][:6]], form, None)
 
 
 def test_feedback_functions_are_orthonormal_on_the_record_and_lose_what_is_linear():

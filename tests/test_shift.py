@@ -9,12 +9,17 @@ from scipy.optimize import minimize
 import optid
 import optid.identify.subspace.shift
 from formulations.constraints.poles import damped, disc, sector, stable, strip
-from formulations.shift import constrained_shift
+from formulations.hammerstein_ss import SUBSPACE
 from optid.backends import Answer, find
 from optid.certificate.infeasibility import explain
 from optid.errors import DataWarning, InfeasibleError, StructureError
 from optid.program.solution import Status
 from optid.solving.solve import Evidence, run
+
+
+def constrained_shift(up, down, rules=()):
+    """The step with the problems of the formulation."""
+    return optid.identify.subspace.shift.constrained_shift(up, down, rules, (SUBSPACE.shift, SUBSPACE.centre))
 
 
 def observability(matrix, outputs, rows, rng, noise=0.0):

@@ -9,6 +9,7 @@ from typing import Any, ParamSpec
 import numpy as np
 
 from optid.errors import StructureError
+from optid.program.limits import named
 from optid.program.view import View
 
 P = ParamSpec("P")
@@ -47,6 +48,10 @@ class Rule:
     def __call__(self, view: View) -> dict[str, Any]:
         """Build the constraint in the variables of a formulation."""
         return {self.name: self.build(view)}
+
+    def members(self, view: View) -> list[Any]:
+        """Return its CVXPY constraints alone."""
+        return [limit.member for limits in named(self(view), "").values() for limit in limits]
 
     def named(self, name: str) -> "Rule":
         """Return the same constraint under another name, for two of a kind."""

@@ -22,6 +22,7 @@ from optid.identify.prediction_error.state_search import complete, errors_and_st
 from optid.identify.prediction_error.tangent_descent import refine
 from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.subspace.plan import Plan, in_record_units, planned
+from optid.identify.subspace.procedure import SubspaceSteps
 from optid.models import HammersteinSS
 from optid.program.solution import Status
 from optid.program.units import energy_unit, in_units, inverse
@@ -33,14 +34,14 @@ WORDS = {"criterion": tuple(SIMULATORS), "stability": ("stable", "free"),
          "weighting": ("auto", "scale", "variance", "determinant")}
 
 
-def fit_states(name: str, data: Data, nx: int | str, *, pose: Pose, subspace: Callable[[Plan], Procedure],
+def fit_states(name: str, data: Data, nx: int | str, *, pose: Pose, subspace: SubspaceSteps,
                criterion: str, stability: str, weighting: str, iterations: int, constraints: Sequence[Any],
                initial: Any, block_rows: Any, basis: Any = "linear", feedback_basis: Any = None, offset: Any = True,
                feedthrough: Any = True, extend: Callable[..., Any] | None = None,
                finish: Callable[..., Procedure] | None = None) -> Procedure:
     """Fit a state-space model in the units of the samples, and return it in those of the record.
 
-    ``pose`` states the problem of a fit, ``subspace`` is the procedure of a subspace fit to start from.
+    ``pose`` states the problem of a fit, ``subspace`` those of a subspace fit to start from.
     ``extend`` makes (errors, optimum, figures) of a model with more functions from (errors, optimum, initial models
     with these functions), None for none.
     ``finish`` is a procedure of (plan, errors, constraints, optimum, figures) that returns the evidence; None
@@ -112,7 +113,7 @@ def _block_rows(plan: Plan) -> list[int | None]:
     return list(dict.fromkeys([None, min(2 * least, most), min(4 * least, most)]))
 
 
-def _subspace_starts(subspace: Callable[[Plan], Procedure], plan: Plan, block_rows: Sequence[int | None],
+def _subspace_starts(subspace: SubspaceSteps, plan: Plan, block_rows: Sequence[int | None],
                      imputes: bool, found: dict[str, HammersteinSS], predicts: bool) -> Procedure:
     """Add the models of subspace fits to those found, and return the order; or that no poles satisfy the constraints.
 
@@ -123,7 +124,7 @@ def _subspace_starts(subspace: Callable[[Plan], Procedure], plan: Plan, block_ro
     for rows in block_rows:
         try:
             start = replace(plan, nx=plan.nx if nx is None else nx, block_rows=rows, imputes=imputes)
-            evidence = yield from quietly(subspace(start))
+            evidence = yield from quietly(subspace.run(start))
         except (RankError, StructureError, np.linalg.LinAlgError) as error:
             refusal = refusal or error
             continue

@@ -25,6 +25,7 @@ WEAK = 0.1  # share of the energy of the feedback that simulated feedback explai
 # missing outputs are estimated where fewer complete windows than this are left per row of the Hankel matrix, and a
 # smaller share than this of all windows
 SCARCE, INTACT = 20, 0.8
+LEAST = 1e-10  # relative singular value below which a direction is always dropped
 INSIDE = 0.999  # modulus to which the poles of an unstable estimate are brought
 
 
@@ -66,7 +67,7 @@ class Windows:
         """Return the projection with the instruments and the weighting of the plan."""
         plan = self.plan
         found = project(self.records, self.expansion, self.alpha, instruments=plan.instruments, offset=plan.offset,
-                        form=plan.form, tolerance=plan.tolerance)
+                        form=plan.form, tolerance=None if plan.tolerance is None else max(plan.tolerance, LEAST))
         return found if plan.weighting == BEST else replace(found, weighting=plan.weighting)
 
     def ordered(self) -> "Observability":
@@ -177,12 +178,12 @@ class Observability:
         gain = np.array(kalman_gain(a, c, np.eye(len(a)), level).K) if closed else np.zeros((len(a), len(c)))
         coloured = instruments and expansion.simulated and not plan.instruments.endswith("past")
         form = ObserverForm(a, c, gain, expansion, len(records), plan.direct(), plan.offset, 1 / self.scale, coloured)
-        return observer_problem(records, form, [record[:, plan.data.m :] for record in plan.records])
+        return observer_problem(records, form, plan, [record[:, plan.data.m :] for record in plan.records])
 
     def model(self) -> HammersteinSS:
         """Return the least-squares model without constraints, A contracted; errors as of `step`."""
         step = self.step(self.contracted())
-        return step.model(self.windows.plan.data, step.start())
+        return step.model(step.start())
 
 
 def estimate_observability(plan: Plan) -> Observability:

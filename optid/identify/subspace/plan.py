@@ -50,6 +50,9 @@ class Plan:
     def __post_init__(self) -> None:
         for name, known in WORDS.items():
             one_of(name, getattr(self, name), known)
+        if self.tolerance is not None and not 0 <= self.tolerance < 1:
+            raise StructureError(f"tolerance={self.tolerance!r}: it must be a number in [0, 1).")
+        check_integer(self.iterations, "iterations", 0)
         if self.nx not in ("auto", "gap"):
             check_integer(self.nx, "nx, unless 'auto' or 'gap',")
         if not self.units.y_scale:

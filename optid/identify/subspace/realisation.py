@@ -6,8 +6,9 @@ its own initial state; those of all but the first run of an experiment are elimi
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import cvxpy as cp
 import numpy as np
 
 from optid.arrays import Array
@@ -16,8 +17,10 @@ from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.data.stretches import runs_of
 from optid.errors import RankError
+from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.regressors import ObserverForm
 from optid.models import HammersteinSS, Nonlinearity
+from optid.program.units import energy_unit, outer_bases
 from optid.statistics.expansion import Expansion
 from optid.statistics.factors import add_to_root
 from optid.structures.bilinear import starts
@@ -42,6 +45,7 @@ class Realisation:
     form: ObserverForm  # the layout
     problem: RankOne  # ``||R z - s||^2 + remainder`` with one rank-one block per channel; weighted units
     rows: int  # equations used
+    plan: Plan  # whose record it is
     factored: bool = False  # whether channels are rank one in the programme itself
 
     def least_squares(self) -> Array:
@@ -96,9 +100,43 @@ class Realisation:
             found |= {theta: value} if point is None else {mu: point.mus[i], b: point.bs[i]}
         return found
 
-    def model(self, data: Data, values: Mapping[str, Array]) -> HammersteinSS:
+    @property
+    def linear(self) -> tuple[str, ...]:
+        """Names of the unknowns outside products, in their order in z."""
+        return ("x0", "offset") if self.form.offset else ("x0",)
+
+    def facts(self) -> dict[str, Any]:
+        """Return what constraints may ask besides named expressions: keyword arguments of a `View`."""
+        x, units = self.form.expansion, self.plan.units
+        return {"channels": x.input_names, "outputs": x.output_names, "units": units,
+                "bases": dict(zip(x.input_names, outer_bases(x.inputs, units))),
+                "gauge": "norm" if self.factored else "", "reference": {"A": self.form.a, "C": self.form.c}}
+
+    def common(self) -> dict[str, Any]:
+        """Return the constraints about coefficients, scale and unit of the `optid.core.problem.Problem`."""
+        relative = np.any(self.form.weights != 1)  # to the sizes of outputs in the unit of the residuals
+        return {"builders": self.plan.about("coefficients"), "scale": self.problem.scale,
+                "unit": 1.0 if relative else energy_unit(self.plan.units)}
+
+    def expressions(self, thetas: Sequence[Any]) -> dict[str, Any]:
+        """Return ``Bu`` (n, p), ``Du`` (l, p) and ``Ez`` (n, q) of expressions of the matrices of all channels.
+
+        These are (P, n + l) or, without feedthrough, (P, n); where every channel is linear ``B`` and ``D`` come too.
+        """
+        form, n, m = self.form, self.form.n, self.form.expansion.m
+        inner = [theta[:, :n].T for theta in thetas]
+        direct = [theta[:, n:].T if direct else np.zeros((form.l, theta.shape[0]))
+                  for theta, direct in zip(thetas, form.feedthrough)]
+        found = {"Bu": cp.hstack(inner[:m]), "Du": cp.hstack(direct)}
+        if form.expansion.q:
+            found["Ez"] = cp.hstack(inner[m:])
+        if all(isinstance(basis, Linear) for basis in form.expansion.inputs):
+            found |= {"B": found["Bu"], "D": found["Du"]}
+        return found
+
+    def model(self, values: Mapping[str, Array]) -> HammersteinSS:
         """Return the model of a point; a matrix is split in the Kronecker metric of the least squares."""
-        form, x = self.form, self.form.expansion
+        form, x, data = self.form, self.form.expansion, self.plan.data
         if self.names[0][0] in values:
             pairs = [(np.asarray(values[mu]), np.asarray(values[b])) for mu, b, _ in self.names]
         else:
@@ -119,10 +157,11 @@ class Realisation:
         return replace(found.turned(signs), gauge="norm")
 
 
-def observer_problem(records: Sequence[Array], form: ObserverForm, targets: Sequence[Array] | None = None
+def observer_problem(records: Sequence[Array], form: ObserverForm, plan: Plan, targets: Sequence[Array] | None = None
                      ) -> Realisation:
-    """Compress the step from raw channels (N, m + l), or (N, m + 2 l) with simulated outputs, one array per experiment.
+    """Compress the step of a plan.
 
+    The records are raw channels (N, m + l), or (N, m + 2 l) with simulated outputs, one array per experiment.
     ``targets`` are the measured outputs (N, l) where some in the records are estimated. Fewer equations than unknowns
     are a `RankError`.
     """
@@ -150,7 +189,7 @@ def observer_problem(records: Sequence[Array], form: ObserverForm, targets: Sequ
         root = add_to_root(np.zeros((size + 1, size + 1)), root[:size, np.r_[: size - extra, size : total + 1]])
     problem = RankOne(root[:size, :size], root[:size, size], float(root[size, size] ** 2), form.blocks, form.linear,
                       energy)
-    return Realisation(form, problem, rows)
+    return Realisation(form, problem, rows, plan)
 
 
 def _oriented(mu: Array, b: Array, *, linear: bool) -> tuple[Array, Array]:

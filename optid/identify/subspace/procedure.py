@@ -1,0 +1,97 @@
+"""The steps that the subspace methods share, for the problems that a formulation states.
+
+1. The observability matrix from projections, no problem: `optid.identify.subspace.observability`.
+2. (A, C) from its shift invariance, poles where the constraints want them: `optid.identify.subspace.shift`.
+3. B, D, E, offset and x0 with the constraints on coefficients, for these (A, C).
+4. The noise model from the prediction errors, when it is needed: `optid.identify.noise`.
+"""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from optid.certificate.hankel import simulation_bound
+from optid.core.problem import Problem
+from optid.core.program import as_program
+from optid.data.record import Data
+from optid.errors import DataWarning
+from optid.identify.noise import with_noise_or_reason
+from optid.identify.subspace.observability import INSIDE, Observability, estimate_observability
+from optid.identify.subspace.plan import Plan, in_record_units, planned
+from optid.identify.subspace.realisation import Realisation
+from optid.identify.subspace.shift import constrained_shift
+from optid.models.roots import spectral_radius
+from optid.program.solution import Bound, Solution, Status
+from optid.solving.solve import Evidence, Procedure
+
+# multipliers up to which the proof of the third step, which says nothing of (A, C), is worth a semidefinite programme
+RELAXED = 150
+
+
+@dataclass(frozen=True)
+class SubspaceSteps:
+    """How a formulation states the problems of the steps.
+
+    Attributes:
+        shift, centre: those of the second; see `optid.identify.subspace.shift.Programmes`.
+        split: that of the third.
+        stable: radius -> the rule that brings the poles of an unstable estimate inside it.
+    """
+
+    shift: Callable[..., Problem]
+    centre: Callable[..., Problem]
+    split: Callable[[Realisation], Problem]
+    stable: Callable[[float], Any]
+
+    def fit(self, name: str, data: Data, **settings: Any) -> Procedure:
+        """Plan a method (`planned`), run it, and return its model in the units of the record."""
+        plan = planned(name, data, **settings)
+        return in_record_units(self.run(plan), plan)
+
+    def run(self, plan: Plan, found: Observability | None = None) -> Procedure:
+        """Run the steps of a plan and return the model with singular values, condition of R11 and further figures.
+
+        The observability matrix, with what was measured before, is that of projections where it is None.
+        """
+        found = estimate_observability(plan) if found is None else found
+        a, gamma, l, figures = found.least_squares(), found.scaled, plan.data.l, dict(found.figures)  # noqa: E741
+        doubt, rules = "", plan.about("poles")
+        if rules or plan.stability == "auto" and spectral_radius(a) >= 1:
+            shift = yield from constrained_shift(
+                gamma[:-l], gamma[l:], rules or (self.stable(INSIDE),), (self.shift, self.centre))
+            if shift.a is None:
+                return Evidence.pointless(shift.status, shift.reason)
+            if shift.applied:
+                figures["suboptimality of A under the pole constraints"] = shift.suboptimality
+                if not rules:
+                    warnings.warn(
+                        f"the subspace estimate of A is unstable (largest modulus {spectral_radius(a):.4g}): its "
+                        f"poles were brought to modulus {INSIDE}. Use stability='free' for a plant that is "
+                        "unstable without its feedback.", DataWarning, stacklevel=2)
+            a, doubt = shift.a, shift.reason if shift.status is Status.INACCURATE else ""
+        step = found.step(a)
+        step = replace(step, factored=plan.split == "exact" and any(min(shape) > 1 for shape in step.form.blocks))
+        program = as_program(self.split(step), RELAXED)
+        solution: Solution = yield program
+        if not solution.has_point:
+            return Evidence.pointless(solution.status, solution.reason)
+        model = program.recover(solution.values)
+        status = Status.LOCAL if solution.status is Status.OPTIMAL else solution.status
+        status, reason = (Status.INACCURATE, doubt) if doubt else (status, solution.reason)
+        return Evidence(model, solution.objective, partial(_bound, plan, step, solution, program.unit, len(gamma) // l),
+                        status, reason, figures | step.ratios(), partial(with_noise_or_reason, model, plan.data))
+
+
+def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block_rows: int) -> Bound:
+    """Return the Hankel bound of the objective in units of the record; none where no proof was requested."""
+    said = "the (A, C) step minimises no criterion of the whole model"
+    if solution.bound is None:
+        return Bound.none(said)
+    if solution.proof:
+        said += "; for this (A, C) the coefficients are proved optimal"
+    form = step.form
+    bound = simulation_bound(plan.records, form.expansion, form.n, form.weights, solution.objective / unit, block_rows,
+                             said, not form.injected and not form.extra)
+    return replace(bound, value=unit * bound.value)
