@@ -1,6 +1,7 @@
 """Set membership: the least factor of a plain linear programme, proofs added up by hand, none of them false."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ N = 20
 
 @pytest.fixture(scope="module")
 def found():
-    return dictionary(small(), process={"load": LOAD}, kinds=["bias", "loss", "drift", "noise"])
+    return dictionary(small(), process={"load": LOAD}, kinds=["bias", "loss", "drift", "noise", "spike"])
 
 
 def window(found, seed, faults=(), missing=0.0):
@@ -123,7 +124,8 @@ def test_noise_within_its_bounds_never_exceeds_a_proof(found):
 
 
 def test_no_false_proof_and_no_false_exclusion(found):
-    kinds = {"actuator:u1": Fault.step, "sensor:y2": Fault.step, "sensor:y1 drift": Fault.ramp}
+    kinds = {"actuator:u1": Fault.step, "sensor:y2": Fault.step, "sensor:y1 drift": Fault.ramp,
+             "sensor:y1 spike": partial(Fault.step, end=10)}
     for seed, (label, make) in enumerate(kinds.items()):
         assert not membership(found.model, window(found, seed), solver="highs").impossible
         data = window(found, seed, make(found[label].name, 9, 0.4 if make == Fault.ramp else 2.5))

@@ -11,7 +11,7 @@ onset between them. Bounds of t are recomputed from parity vectors, not taken fr
 Named variables: ``t``; named expressions: ``x`` (N, n) and, with a candidate, ``size``.
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -20,29 +20,15 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.core.problem import Problem
-from optid.core.terms import Inner, Values
+from optid.core.terms import Inner
 from optid.data.record import Data
-from optid.errors import StructureError
-from optid.faults.consistency.bounded_noise import (
-    SIGMAS,
-    BoundedWindow,
-    Membership,
-    ParityProof,
-    bounded_window,
-    parity_proof,
-)
-from optid.faults.signatures import Candidate, Dictionary
-from optid.program.solution import Bound, Solution, Status, relative_gap
+from optid.faults.consistency.bounded_noise import SIGMAS, BoundedWindow, bounded_window
+from optid.faults.consistency.candidate_tests import judge_candidates, prove_factor
+from optid.faults.signatures import Dictionary
 from optid.program.view import View
-from optid.solving.solve import Evidence, Procedure
+from optid.solving.solve import Procedure
 
 Array = np.ndarray
-
-PROVED = 1e-6
-"""Relative gap below which a factor is proved to be the least."""
-
-Signature = tuple[Array, Array]
-"""Additions of a fault of unknown sizes: (N, n, c) to x(k), (N, l, c) to y(k)."""
 
 
 def membership(model: Any, data: Data, *, bounds: Any = SIGMAS, faults: Dictionary | None = None,
@@ -67,85 +53,10 @@ def membership(model: Any, data: Data, *, bounds: Any = SIGMAS, faults: Dictiona
         DataError, StructureError: see `optid.faults.consistency.bounded_noise.bounded_window`; onsets outside the
             window.
     """
-    window = bounded_window(model, data, bounds)
-    tried = _onsets(onsets, window.count)
-    solution = yield _posed(window).subject_to(*constraints)
-    factor, proof = _factor(solution), _proof_of(solution)
-    factors: dict[str, float] = {}
-    where: dict[str, int | None] = {}
-    proofs: dict[str, dict[tuple[int, int], ParityProof]] = {}
-    untested: dict[str, str] = {}
-    for candidate in faults.candidates if faults is not None and (candidates or proof is not None) else ():
-        if not (candidate.additive or candidate.columns):
-            untested[candidate.label] = "it has no signature: test it as an arbitrary waveform"
-            continue
-        if candidate.additive:
-            parts = (candidate.into_state, candidate.into_output)
-            unit: Any = tuple(np.broadcast_to(part, (window.count, *part.shape)) for part in parts)
-        else:
-            assert faults is not None
-            unit = faults.additions(candidate, window.count, 0, window.u)
-        found = yield from _possible(window, candidate, unit, tried)
-        factors[candidate.label], where[candidate.label], proofs[candidate.label] = found
-    status = "" if solution.status in (Status.OPTIMAL, Status.LOCAL) else f"{solution.status}: {solution.reason}"
-    shown = solution.bound.multipliers if solution.has_point and solution.bound is not None else None
-    result = Membership(factor, shown, factors, where, proofs, untested, window, status)
-    return Evidence(result, factor, solution.bound or Bound.none(solution.reason), solution.status, solution.reason,
-                    {"least factor of the bounds": factor, "candidates possible": len(result.consistent)})
+    return judge_candidates(bounded_window(model, data, bounds), _problem, faults, onsets, candidates, constraints)
 
 
-def _possible(window: BoundedWindow, candidate: Candidate, unit: Signature, tried: list[int] | None
-              ) -> Generator[Problem, Solution, tuple[float, int | None, dict[tuple[int, int], ParityProof]]]:
-    """Return a factor and onset at which a candidate is possible; or the least factor proved, with all proofs.
-
-    The factor is NaN where the solver gave neither; `unit` is the addition of a unit course in each sample.
-    """
-    if tried is None:
-        solution = yield _posed(window, _between(candidate, unit, 0, window.count))
-        proof = _proof_of(solution)
-        return (_factor(solution), None, {}) if proof is None else (proof.factor, None, {(0, window.count - 1): proof})
-    proofs: dict[tuple[int, int], ParityProof] = {}
-    waiting: list[tuple[float, int, int]] = [(0.0, 0, len(tried) - 1)]
-    while waiting:
-        waiting.sort()  # the smallest factor first
-        _, first, last = waiting.pop(0)
-        solution = yield _posed(window, _between(candidate, unit, tried[first], tried[last]))
-        proof, middle = _proof_of(solution), (first + last) // 2
-        if proof is not None:
-            proofs[tried[first], tried[last]] = proof
-        elif first == last:
-            return _factor(solution), tried[first], {}
-        else:
-            value = solution.objective if solution.has_point else 0.0
-            waiting += [(value, first, middle), (value, middle + 1, last)]
-    return min(proof.factor for proof in proofs.values()), None, proofs
-
-
-def _factor(solution: Solution) -> float:
-    return solution.objective if solution.has_point else float("nan")
-
-
-def _proof_of(solution: Solution) -> ParityProof | None:
-    """Return the proof that the window is impossible, where there is one."""
-    proof = solution.bound.multipliers if solution.has_point and solution.bound is not None else None
-    return proof if proof is not None and proof.proved else None
-
-
-def _between(candidate: Candidate, unit: Signature, first: int, last: int) -> Signature:
-    """Basis that contains the signature for every onset in [first, last]; for last = N every time course."""
-    k, jump = np.arange(len(unit[0])), candidate.kind == "jump"
-    courses = [k == at for at in range(first, min(last + jump, k.size))]
-    if last < k.size and not jump:
-        ramp = candidate.kind == "drift"
-        courses += [np.maximum(k - last + 1, 0)] * ramp + [k >= last] * (not ramp or first < last)
-    shapes = np.array(courses, dtype=float)
-    state, output = (np.einsum("ck,kid->kicd", shapes, part).reshape(k.size, part.shape[1], -1) for part in unit)
-    sizes = np.maximum(np.abs(state[1:]).max(axis=(0, 1), initial=0.0), np.abs(output).max(axis=(0, 1), initial=0.0))
-    seen = sizes > 0
-    return state[:, :, seen] / sizes[seen], output[:, :, seen] / sizes[seen]
-
-
-def _posed(window: BoundedWindow, signature: Signature | None = None) -> Problem:
+def _problem(window: BoundedWindow, signature: Any = None) -> Problem:
     """State the linear problem of the healthy plant, or with additions of unknown sizes."""
     n, count = window.A.shape[0], window.count
     later, earlier = (sp.diags_array(np.ones(count - 1), offsets=k, shape=(count - 1, count)) for k in (1, 0))
@@ -174,33 +85,17 @@ def _posed(window: BoundedWindow, signature: Signature | None = None) -> Problem
     return Problem(
         "fault.membership", start, (Inner({"t": np.array(1.0)}),),
         further=lambda v, _: {"x": cp.reshape(v["states"], (count, n), order="C")}, restrictions=(possible,),
-        proof=partial(_certified, window, signature, bounded, exact, bounds))
+        proof=partial(_proof, window, signature, bounded, exact, bounds))
 
 
-def _certified(window: BoundedWindow, signature: Signature | None, bounded: Array, exact: Array, bounds: Array,
-               problem: Problem, values: Values, duals: Values) -> tuple[Bound, None]:
-    """Return the factor that the parity vector near the multipliers proves."""
-    if np.size(duals.get("noise", ())) != 2 * bounded.size:
-        return Bound.none("the solver gave no multipliers"), None
+def _proof(window: BoundedWindow, signature: Any, bounded: Array, exact: Array, bounds: Array,
+           problem: Problem, values: Mapping[str, Array], duals: Mapping[str, Array]) -> tuple[Any, None]:
+    """Return the factor that the multipliers of the noise prove."""
     weights = np.zeros(bounds.size)
+    if np.size(duals.get("noise", ())) != 2 * bounded.size:
+        return prove_factor(window, signature, np.zeros(0), problem, values), None
     upper, lower = np.split(np.asarray(duals["noise"], dtype=float), 2)
     weights[bounded] = (upper - lower) / bounds[bounded]
     if exact.size and np.size(duals.get("no noise", ())) == exact.size:
         weights[exact] = np.asarray(duals["no noise"], dtype=float)
-    p = weights[(window.count - 1) * window.A.shape[0] :].reshape(window.e.shape)
-    proof = parity_proof(window, p, window.unseen(*(signature or (None, None))))
-    gap = relative_gap(problem.value(values), proof.factor, problem.scale)
-    free, words = not problem.constraint_names, f"parity vector, relative gap {gap:.1e}"
-    return Bound(proof.factor, free and gap < PROVED, "parity",
-                 words if free else "the bound is that without the further constraints", multipliers=proof), None
-
-
-def _onsets(onsets: Sequence[int] | str, count: int) -> list[int] | None:
-    if isinstance(onsets, str):
-        if onsets not in ("all", "course"):
-            raise StructureError(f"onsets={onsets!r}: use 'all', 'course' or integers.")
-        return list(range(count)) if onsets == "all" else None
-    chosen = sorted({int(k) for k in onsets})
-    if not chosen or chosen[0] < 0 or chosen[-1] >= count:
-        raise StructureError(f"onsets: they must be integers from 0 to {count - 1}, at least one.")
-    return chosen
+    return prove_factor(window, signature, weights, problem, values), None

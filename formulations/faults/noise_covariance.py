@@ -24,13 +24,9 @@ from optid.errors import StructureError, nearest
 from optid.faults.consistency.noise_matching import CovarianceMatch, CovarianceProblem, covariance_problem
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened
-from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
 
 FORMS = ("places", "full")
-
-NOTHING = 1e-4
-"""Covariances, in standard deviations, below which the result of an interior-point method is zero."""
 
 
 def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", lags: int | None = None, onset: int = 0,
@@ -56,9 +52,7 @@ def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", l
         raise StructureError(f"form={form!r}. {nearest(str(form), FORMS)}")
     problem = covariance_problem(found, whitened, lags=lags, onset=onset)
     solution = yield (_places if form == "places" else _full)(problem).subject_to(*constraints)
-    bound = solution.bound or Bound.none(solution.reason)
-    return Evidence(_matched(problem, solution), solution.objective, bound, solution.status, solution.reason,
-                    {"lags": problem.lags})
+    return Evidence.of(solution, CovarianceMatch.of(problem, solution), {"lags": problem.lags})
 
 
 def _places(problem: CovarianceProblem) -> Problem:
@@ -75,7 +69,7 @@ def _places(problem: CovarianceProblem) -> Problem:
 
 def _full(problem: CovarianceProblem) -> Problem:
     """The semidefinite problem of full covariances of the added process and sensor noise."""
-    of_process, of_sensor = _units(problem)
+    of_process, of_sensor = problem.units
     parts = {"Q": problem.by_process * of_process.ravel(order="F"), "R": problem.by_sensor * of_sensor.ravel(order="F")}
     return Problem(
         "fault.noise_covariance full", {"Q": np.eye(problem.nx), "R": np.eye(problem.l)},
@@ -83,23 +77,3 @@ def _full(problem: CovarianceProblem) -> Problem:
         further=lambda v, _: {"Q": cp.multiply(of_process, v["Q"]), "R": cp.multiply(of_sensor, v["R"])},
         restrictions=(lambda view: {"process covariance": view["Q"] >> 0, "sensor covariance": view["R"] >> 0},),
         scale=0.5 * float(problem.target @ problem.target))
-
-
-def _units(problem: CovarianceProblem) -> list[np.ndarray]:
-    """Units of the entries of Q and of R."""
-    return [np.sqrt(np.outer(units, units)) for units in (problem.state_units, problem.output_units)]
-
-
-def _matched(problem: CovarianceProblem, solution: Solution) -> CovarianceMatch:
-    """Read the solution of either programme."""
-    rho, gains, Q, R = np.full(len(problem.labels), np.nan), np.full(len(problem.labels), np.nan), None, None
-    if solution.has_point and "scaled" in solution.values:
-        scaled = np.asarray(solution.values["scaled"])
-        gains = np.where(scaled > NOTHING, scaled, 0.0)
-        rho = gains / np.linalg.norm(problem.signatures, axis=0)
-    elif solution.has_point:
-        Q, R = (np.asarray(solution.values[name]) * units for name, units in zip("QR", _units(problem)))
-    certified = solution.status in (Status.OPTIMAL, Status.LOCAL) and solution.proof
-    status = "" if certified else f"{solution.status}: {solution.reason}".rstrip(": ")
-    return CovarianceMatch(problem.labels, rho, gains, Q, R, solution.objective, solution.gap, certified, problem.lags,
-                           status)

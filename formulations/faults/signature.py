@@ -17,16 +17,15 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from optid.core.group_sparse import group_squares
 from optid.core.problem import Problem
-from optid.core.terms import GroupNorms, Squares, Values
+from optid.core.terms import GroupNorms
 from optid.errors import StructureError
 from optid.faults.search.atoms import Atoms, atoms_of
 from optid.faults.search.calibration import Thresholds
 from optid.faults.search.scanning import Scan
-from optid.faults.search.sparse import ActiveGroup, SparseResult
-from optid.program.solution import Bound, Solution, Status
+from optid.faults.search.sparse import SparseResult
 from optid.solving.solve import Evidence, Procedure
-from optid.structures.group_sparse import GroupProblem
 
 
 def signature(found: Scan, limits: Thresholds, *, penalty: float = 1.0, constraints: Sequence[Any] = ()) -> Procedure:
@@ -47,11 +46,10 @@ def signature(found: Scan, limits: Thresholds, *, penalty: float = 1.0, constrai
     atoms = atoms_of(found, limits)
     problem = _problem(atoms, found.whitened.r.ravel(), penalty).subject_to(*constraints)
     solution = yield problem
-    result = _sparse_result(problem, solution, atoms, len(found.whitened.r))
-    return Evidence(result, solution.objective, solution.bound or Bound.none(solution.reason), solution.status,
-                    solution.reason,
-                    {"groups active": len(result.active), "clusters": len(result.clusters),
-                     "relative gap": result.gap, "smallest penalty without a fault": result.largest})
+    result = SparseResult.of(problem, solution, atoms, len(found.whitened.r))
+    return Evidence.of(solution, result, {
+        "groups active": len(result.active), "clusters": len(result.clusters), "relative gap": result.gap,
+        "smallest penalty without a fault": result.largest})
 
 
 def _problem(atoms: Sequence[Atoms], r: np.ndarray, penalty: float) -> Problem:
@@ -60,26 +58,23 @@ def _problem(atoms: Sequence[Atoms], r: np.ndarray, penalty: float) -> Problem:
         raise StructureError(f"penalty={penalty!r}; it must be a positive number.")
     if not atoms:
         raise StructureError("No candidate is tested at any onset: the programme has no groups.")
-    start, parts, weights, designs = {}, {}, {}, []
+    start, axes, weights = {}, {}, {}
     for atom in atoms:
-        name, axes = f"a[{atom.label}]", np.moveaxis(atom.axes, 1, 0)  # (N l, onsets, d)
-        designs.append(axes.reshape(r.size, -1))
-        parts[name] = np.swapaxes(axes, 1, 2).reshape(r.size, -1)
-        weights[name] = np.full(atom.onsets.size, penalty * np.sqrt(atom.threshold))
+        name = f"a[{atom.label}]"
+        axes[name] = np.moveaxis(atom.axes, 1, 0)  # (N l, onsets, d)
+        weights[name] = np.full(atom.onsets.size, np.sqrt(atom.threshold))
         along = np.einsum("tkd,k->td", atom.axes, r)
         best = np.argmax(np.sum(along**2, axis=1))  # the candidate alone, at its best onset
         start[name] = np.where(np.arange(len(along))[:, None] == best, along, 0.0)
-    edges = np.cumsum([0, *(atom.dimension for atom in atoms for _ in atom.onsets)])
-    numbers = GroupProblem(np.hstack(designs), r, edges, np.concatenate(list(weights.values())) / penalty)
 
-    misfit = Squares.half(r, parts, numbers)  # 1/2 ‖r - sum Q a‖²
-    groups = GroupNorms(weights)  # lambda sum sqrt(q) ‖a‖
+    misfit = group_squares(r, axes, weights)  # 1/2 ‖r - sum Q a‖²
+    groups = GroupNorms({name: penalty * one for name, one in weights.items()})  # lambda sum sqrt(q) ‖a‖
 
     return Problem("fault.signature", start, (misfit, groups), further=partial(_sizes, atoms),
                    scale=0.5 * float(r @ r), weights={"lambda": penalty})
 
 
-def _sizes(atoms: Sequence[Atoms], view: Mapping[str, Any], _: Values) -> dict[str, Any]:
+def _sizes(atoms: Sequence[Atoms], view: Mapping[str, Any], _: object) -> dict[str, Any]:
     """Return the sizes in the units of the faults: size[t] = back[t] a[t]."""
     found = {}
     for atom in atoms:
@@ -87,31 +82,3 @@ def _sizes(atoms: Sequence[Atoms], view: Mapping[str, Any], _: Values) -> dict[s
         found[f"size[{atom.label}]"] = sum(
             cp.multiply(atom.back[:, :, j], a[:, [j]] @ ones) for j in range(atom.dimension))
     return found
-
-
-def _sparse_result(stated: Problem, solution: Solution, atoms: Sequence[Atoms], count: int) -> SparseResult:
-    """Read the solution for a window of some samples; groups that rounding has left of zeros are zeros."""
-    (misfit, _), penalty, bound = stated.terms, stated.weights["lambda"], solution.bound
-    problem: GroupProblem = misfit.lifted
-    certified = bool(solution.has_point and solution.proof and solution.status in (Status.OPTIMAL, Status.LOCAL))
-    zero = np.zeros(problem.weights.size, dtype=bool)
-    if certified and not stated.constraint_names and bound is not None and bound.multipliers is not None:
-        zero = problem.certainly_zero(bound.multipliers, solution.objective - bound.value, penalty)
-    active: list[ActiveGroup] = []
-    masks = {atom.label: np.zeros(count, dtype=bool) for atom in atoms}
-    norms = np.concatenate([np.linalg.norm(solution.values[name], axis=1) for name in stated.start]
-                           ) if solution.has_point else np.zeros(problem.weights.size)
-    floor = 1e-6 * max(float(norms.max()), float(np.sqrt(2 * stated.scale)) * 1e-3)
-    first = 0
-    for atom in atoms:
-        here = slice(first, first + atom.onsets.size)
-        masks[atom.label][atom.onsets] = zero[here]
-        for t in np.flatnonzero((norms[here] > floor) & ~zero[here]):
-            size = atom.back[t] @ np.asarray(solution.values[f"a[{atom.label}]"])[t]
-            active.append(ActiveGroup(atom.label, int(atom.onsets[t]), size, float(norms[here][t])))
-        first += atom.onsets.size
-    active.sort(key=lambda group: -group.deflection)
-    return SparseResult(tuple(active), count, solution.objective,
-                        -np.inf if bound is None else bound.value, solution.gap, certified,
-                        problem.largest(), penalty, masks, f"{solution.status}: {solution.reason}".rstrip(": "),
-                        solution.solver, stated.constraint_names)

@@ -13,6 +13,21 @@ from optid.core.terms import GroupNorms, Squares
 from optid.structures.group_sparse import GroupProblem
 
 
+def group_squares(target: Array, designs: Mapping[str, Array], weights: Mapping[str, Array]) -> Squares:
+    """Return ``1/2 ‖target - sum designs[name] a[name]‖²``, a of shape (T, d), T groups of d coefficients.
+
+    Args:
+        target: (m,).
+        designs: (m, T, d) of every name; see `GroupProblem`, as are the errors raised.
+        weights: (T,), of the norms of the groups.
+    """
+    parts = {name: np.swapaxes(one, 1, 2).reshape(target.size, -1) for name, one in designs.items()}
+    sizes = [one.shape[2] for one in designs.values() for _ in range(one.shape[1])]
+    design = np.hstack([one.reshape(target.size, -1) for one in designs.values()])
+    return Squares.half(target, parts, GroupProblem(
+        design, target, np.cumsum([0, *sizes]), np.concatenate([weights[name] for name in designs])))
+
+
 @dataclass(frozen=True, eq=False)
 class GroupSparseForm(Form):
     """P(a); the multiplier of the constraint ``residual``, which defines (M a - r) / sqrt 2, is a point of the dual."""

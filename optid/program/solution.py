@@ -134,6 +134,12 @@ class Solution:
         return bool(self.values)
 
     @property
+    def doubt(self) -> str:
+        """Status and reason in words, "" for a proved optimum."""
+        certified = self.status.is_optimum and self.proof
+        return "" if certified else f"{self.status}: {self.reason}".rstrip(": ")
+
+    @property
     def false_claim(self) -> bool:
         """Whether the solver claimed a success, or that there can be none, and our measurements took it back."""
         if self.claim in (Status.OPTIMAL, Status.LOCAL):

@@ -134,6 +134,12 @@ class Evidence:
         return self.extend() if self.extend else (self.model, {})
 
     @classmethod
+    def of(cls, solution: Solution, model: Any, figures: Mapping[str, Any] | None = None) -> "Evidence":
+        """Return that of one programme, with what was made of its solution, whether it has a point or not."""
+        bound = solution.bound or Bound.none(solution.reason)
+        return cls(model, solution.objective, bound, solution.status, solution.reason, figures or {})
+
+    @classmethod
     def pointless(cls, status: Status, reason: str) -> "Evidence":
         """Return evidence without a model, with the reason."""
         return cls(None, float("nan"), Bound.none(reason), status, reason)

@@ -29,12 +29,12 @@ def steps(declare: Declaration) -> Callable[[Callable[..., Any]], Callable[..., 
     """
     def mark(function: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(function)
-        def checked(data: Any, **arguments: Any) -> Any:
+        def call(data: Any, **arguments: Any) -> Any:
             check_words(arguments, annotations(function))
             return function(data, **arguments)
 
-        checked.steps = declare  # type: ignore[attr-defined]
-        return checked
+        call.steps = declare  # type: ignore[attr-defined]
+        return call
     return mark
 
 

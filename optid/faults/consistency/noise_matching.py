@@ -1,6 +1,7 @@
 """Covariances of a window by lag, and their signatures of added noise."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +10,12 @@ from optid.errors import DataError, StructureError
 from optid.faults.consistency.noise_changes import noise_places
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened, check_window
+
+if TYPE_CHECKING:
+    from optid.program.solution import Solution
+
+NOTHING = 1e-4
+"""Covariances, in standard deviations, below which the result of an interior-point method is zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +33,11 @@ class CovarianceProblem:
     output_units: Array  # (l,) variances of its sensor noise
     lags: int  # largest lag
 
+    @property
+    def units(self) -> list[Array]:
+        """Units of the entries of Q and of R."""
+        return [np.sqrt(np.outer(units, units)) for units in (self.state_units, self.output_units)]
+
 
 @dataclass(frozen=True, eq=False)
 class CovarianceMatch:
@@ -41,6 +53,19 @@ class CovarianceMatch:
     certified: bool  # whether it is proved optimal
     lags: int  # largest lag
     status: str = ""  # the reason where it is not certified
+
+    @classmethod
+    def of(cls, problem: CovarianceProblem, solution: "Solution") -> "CovarianceMatch":
+        """Read the solution of either programme."""
+        rho, gains, Q, R = np.full(len(problem.labels), np.nan), np.full(len(problem.labels), np.nan), None, None
+        if solution.has_point and "scaled" in solution.values:
+            scaled = np.asarray(solution.values["scaled"])
+            gains = np.where(scaled > NOTHING, scaled, 0.0)
+            rho = gains / np.linalg.norm(problem.signatures, axis=0)
+        elif solution.has_point:
+            Q, R = (np.asarray(solution.values[name]) * units for name, units in zip("QR", problem.units))
+        return cls(problem.labels, rho, gains, Q, R, solution.objective, solution.gap, not solution.doubt, problem.lags,
+                   solution.doubt)
 
     @property
     def best(self) -> str:

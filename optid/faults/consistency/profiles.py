@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -86,10 +87,27 @@ class CourseProblem:
         """Samples N."""
         return self.matrix.shape[1]
 
+    @cached_property
+    def _made(self) -> dict[tuple[str, str], Array]:
+        return {}
+
     def shapes(self, prior: str) -> Array:
         """Return the courses (N, N) of a unit change at every sample: steps, or ramps over the window."""
-        steps = np.tril(np.ones((self.count, self.count)))
-        return steps if prior == "tv" else steps @ steps / self.count
+        if (prior, "shapes") not in self._made:
+            steps = np.tril(np.ones((self.count, self.count)))
+            self._made[prior, "shapes"] = steps if prior == "tv" else steps @ steps / self.count
+        return self._made[prior, "shapes"]
+
+    def design(self, prior: str) -> Array:
+        """Return the effects (N l, N) of these on the window."""
+        if (prior, "design") not in self._made:
+            self._made[prior, "design"] = self.matrix @ self.shapes(prior)
+        return self._made[prior, "design"]
+
+    @property
+    def differences(self) -> Array:
+        """(N, N) what gives the steps of a course, the first from zero."""
+        return np.eye(self.count) - np.eye(self.count, k=-1)
 
     def refitted(self, columns: Array) -> tuple[Array, float]:
         """Return the least-squares coefficients of columns (N l, K) and the residual energy."""

@@ -4,12 +4,18 @@ Its magnitudes are shrunk, and neighbouring onsets share one fault: it selects o
 (`optid.faults.search.subsets`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.faults.search.atoms import Atoms
+
+if TYPE_CHECKING:
+    from optid.core.problem import Problem
+    from optid.program.solution import Solution
 
 REACH = 10
 """Onsets on either side of an active one that are searched exactly, for every candidate."""
@@ -101,6 +107,33 @@ class SparseResult:
         for onset in self.onsets:
             mask[max(onset - reach, 0) : onset + reach + 1] = True
         return mask
+
+    @classmethod
+    def of(cls, stated: "Problem", solution: "Solution", atoms: Sequence[Atoms], count: int) -> "SparseResult":
+        """Read the solution for a window of some samples; groups that rounding has left of zeros are zeros."""
+        (misfit, _), penalty, bound = stated.terms, stated.weights["lambda"], solution.bound
+        problem = misfit.lifted
+        certified = solution.has_point and not solution.doubt
+        zero = np.zeros(problem.weights.size, dtype=bool)
+        if certified and not stated.constraint_names and bound is not None and bound.multipliers is not None:
+            zero = problem.certainly_zero(bound.multipliers, solution.objective - bound.value, penalty)
+        active: list[ActiveGroup] = []
+        masks = {atom.label: np.zeros(count, dtype=bool) for atom in atoms}
+        norms = np.concatenate([np.linalg.norm(solution.values[name], axis=1) for name in stated.start]
+                               ) if solution.has_point else np.zeros(problem.weights.size)
+        floor = 1e-6 * max(float(norms.max()), float(np.sqrt(2 * stated.scale)) * 1e-3)
+        first = 0
+        for atom in atoms:
+            here = slice(first, first + atom.onsets.size)
+            masks[atom.label][atom.onsets] = zero[here]
+            for t in np.flatnonzero((norms[here] > floor) & ~zero[here]):
+                size = atom.back[t] @ np.asarray(solution.values[f"a[{atom.label}]"])[t]
+                active.append(ActiveGroup(atom.label, int(atom.onsets[t]), size, float(norms[here][t])))
+            first += atom.onsets.size
+        active.sort(key=lambda group: -group.deflection)
+        return cls(tuple(active), count, solution.objective, -np.inf if bound is None else bound.value, solution.gap,
+                   certified, problem.largest(), penalty, masks, f"{solution.status}: {solution.reason}".rstrip(": "),
+                   solution.solver, stated.constraint_names)
 
     def __str__(self) -> str:
         """Print the active groups, the gap and the number of zero groups."""

@@ -61,7 +61,7 @@ class Courses(ABC):
         """Return the least and largest values of courses."""
         return {}
 
-    def completed(self, start: Values) -> dict[str, Array]:
+    def complete(self, start: Values) -> dict[str, Array]:
         """Return the values of unknowns and states with those of all other courses."""
         found = dict(start)
         v: dict[str, Any] = {name: cp.Constant(value) for name, value in start.items()}

@@ -128,7 +128,7 @@ class EquationCourses(Courses):
             for j, name in enumerate(errors.equations.states):
                 start[f"states of {name}{label}"] = np.clip(
                     run[:, j], *(end / errors.usual[j] for end in errors.equations.interval(name)))
-        return self.completed(start)
+        return self.complete(start)
 
     def _courses(self, i: int, v: Expressions) -> dict[str, Any]:
         """Return the states of an experiment at the steps of integration."""

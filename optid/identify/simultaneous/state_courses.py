@@ -53,7 +53,7 @@ class StateCourses(Courses):
         """Return the unknowns with the courses of their run."""
         errors = self.criterion
         runs = errors.visited(errors.unknowns.unpack(self.x))
-        return self.completed({**errors.variables.values(self.x),
+        return self.complete({**errors.variables.values(self.x),
                                **dict(zip([f"states{label}" for label in errors.labels], runs))})
 
     def limits(self, start: Values) -> dict[str, tuple[Array, Array]]:
@@ -104,7 +104,7 @@ class StateCourses(Courses):
         states, output, after = v[f"states{label}"], v[f"output{label}"], self._acting(i, v)[0]
         for j, family in enumerate(errors.unknowns.expansion.feedback):
             nu = v[errors.key("nu", j)] if family.size > 1 else np.ones(1)
-            g = (expressed(family.basis, output[:, family.output], family.vectors @ nu)
+            g = (express(family.basis, output[:, family.output], family.vectors @ nu)
                  - family.intercept @ nu - output @ (family.slope.T @ nu))
             after = after + cp.outer(g, v[errors.key("e", j)])
         first = v["x0"] if len(errors.labels) == 1 else v["x0"][:, i]
@@ -128,7 +128,7 @@ class StateCourses(Courses):
             shown = shown + cp.outer(f, b[n:]) if unknowns.feedthrough[c] else shown
         for j, one in enumerate(unknowns.latent):
             matrix = v[key("g", j)]
-            h = expressed(one.basis, v[f"signal of {key('z', j)}{errors.labels[i]}"], one.vectors @ v[key("c", j)])
+            h = express(one.basis, v[f"signal of {key('z', j)}{errors.labels[i]}"], one.vectors @ v[key("c", j)])
             after = after + cp.outer(h, matrix[:n])
             shown = shown + cp.outer(h, matrix[n:]) if one.direct else shown
         if unknowns.constant:
@@ -188,7 +188,7 @@ def _judged_by_run(errors: StateErrors, x: Array, solution: Solution) -> tuple[S
     return Status.LOCAL, NO_BOUND.format(errors.errors)
 
 
-def expressed(basis: Basis, v: Any, coefficients: Any) -> Any:
+def express(basis: Basis, v: Any, coefficients: Any) -> Any:
     """Return sum_j coefficients[j] eta_j(v) of a basis with a formula, as an expression of a course v."""
     low, high = span(basis)
     if isinstance(basis, Polynomial):

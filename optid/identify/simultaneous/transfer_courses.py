@@ -111,4 +111,4 @@ class TransferCourses(Courses):
                 start[f"a of order {m}"] = level
             kappa[m - 1] = level[-1]
             level = (level[:-1] - level[-1] * level[-2::-1]) / (1 - level[-1] ** 2)
-        return self.completed({**start, "kappa": kappa} if na else start)
+        return self.complete({**start, "kappa": kappa} if na else start)
