@@ -3,6 +3,7 @@
 import signal
 import warnings
 from contextlib import contextmanager
+from inspect import signature
 
 import numpy as np
 
@@ -71,8 +72,7 @@ def draw(seed: int) -> tuple[tuple[object, object], str, dict]:
     """Return a record, the name of a formulation, and its arguments, most of which make sense."""
     rng = np.random.default_rng([seed, 77])
     name = str(rng.choice(sorted(registered(FORMULATIONS))))
-    takes = registered(FORMULATIONS)[name].load().__code__
-    known = takes.co_varnames[: takes.co_argcount + takes.co_kwonlyargcount]
+    known = signature(registered(FORMULATIONS)[name].load()).parameters
     given = {key: value for key, value in USUAL.items() if key in known}
     for _ in range(int(rng.integers(0, 4))):
         key = str(rng.choice([*(k for k in SHARED if k in known), *PLAIN, str(rng.choice(list(SHARED)))]))

@@ -5,6 +5,7 @@ import pickle
 import warnings
 from contextlib import suppress
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,7 @@ def draw(seed: int) -> tuple[str, optid.Data, str, dict[str, Any]]:
     """Return a system, its record, the name of a formulation, and its arguments."""
     rng = np.random.default_rng([seed, 41])
     name, system = NAMES[seed % len(NAMES)], str(rng.choice(SYSTEMS))
-    code = registered(FORMULATIONS)[name].load().__code__
-    known = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
+    known = signature(registered(FORMULATIONS)[name].load()).parameters
     m, l = (1 if name == "physical" or rng.random() < 0.7 else 2 for _ in range(2))  # noqa: E741
     several = "nx" in known or name.startswith(("arx", "hammerstein_arx"))
     usual = {"na": rng.integers(0, 4), "nb": rng.integers(1, 4), "nk": rng.integers(0, 3), "nc": rng.integers(1, 3),
