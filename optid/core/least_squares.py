@@ -23,7 +23,7 @@ class LeastSquaresForm(Form):
     The structural constraints of its programme only fix directions that do not change F.
     """
 
-    problem: Any  # the numbers, see `optid.program.compressed.Compressed`
+    problem: Any  # the numbers, see `optid.program.compressed`
     linear: tuple[str, ...]  # names of the linear variables in the order of z (each flattened column by column)
     blocks: tuple[tuple[str, str], ...] = ()  # (mu name, b name) of every rank-one block; none without products
     gauge: str = "norm"  # what fixes the scale between mu and b: "norm", "gain" or "b0"

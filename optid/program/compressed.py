@@ -1,8 +1,14 @@
-"""The interface of compressed data that prices, fits and intervals use."""
+"""How far an estimate scatters that is least squares in z, of a record at a size that does not grow with its length.
 
-from collections.abc import Mapping
+Such a compressed record, `optid.core.problem.Problem.compressed`, has the ``problem``, ``‖root z - target‖² +
+remainder``; its ``statistics``, the factor ``root`` of [regressor | outputs] with its number of ``rows``,
+``candidates``, and ``constants`` eliminated, its ``condition`` and ``method``; and the ``energy`` (l,) of the outputs
+in units of the objective. Its methods are ``lifted(values)``, z; ``one_step_fit(values)`` (l,) in %, or None; and
+``spread(z, moves)``, moves (n, k) the derivatives of z by coordinates in which the information is the identity.
+"""
+
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,47 +27,8 @@ class Spread:
     words: tuple[str, ...] = ()  # what the errors are found to be that white ones of one level are not
 
 
-class Compressed(Protocol):
-    """A record reduced to least squares in z, at a size that does not grow with its length.
-
-    Attributes:
-        problem: the numbers of ``‖root z - target‖² + remainder``: root (k, n), target (k,), remainder.
-        statistics: the rows behind it: ``root``, the triangular factor of [regressor | outputs]; ``rows`` used and
-            ``candidates`` in the record; number of ``constants`` eliminated; ``condition`` of the factor and the
-            ``method`` that made it.
-        columns: (n_columns, l) positions in z of the coefficients of the columns of the factor.
-        energy: (l,) sum of squares of every output about its mean, in units of the objective.
-    """
-
-    @property
-    def problem(self) -> Any: ...  # noqa: D102
-    @property
-    def statistics(self) -> Any: ...  # noqa: D102
-    @property
-    def columns(self) -> Any: ...  # noqa: D102
-    @property
-    def energy(self) -> Array: ...  # noqa: D102
-
-    def lifted(self, values: Mapping[str, np.ndarray]) -> Array:
-        """Return z (n,) of named values."""
-        ...
-
-    def one_step_fit(self, values: Mapping[str, np.ndarray]) -> Array | None:
-        """Return the one-step fit (l,) in %; None where only a run of the model tells it."""
-        ...
-
-    def spread(self, z: Array, moves: Array) -> Spread:
-        """Return the scatter of an estimate in k coordinates in which its information is the identity.
-
-        Args:
-            z: (n,) at the minimum.
-            moves: (n, k) its derivatives with respect to the coordinates.
-        """
-        ...
-
-
-def white_spread(compressed: Compressed, z: Array, moves: Array) -> Spread:
-    """Return `Compressed.spread` for rows whose errors are white.
+def white_spread(statistics: Any, columns: Any, z: Array, moves: Array) -> Spread:
+    """Return the scatter for rows whose errors are white; columns (n_columns, l) are the places in z of coefficients.
 
     Multi-output noise is estimated as a full covariance matrix, although the outputs were fitted with equal weights
     (sandwich form).
@@ -69,7 +36,6 @@ def white_spread(compressed: Compressed, z: Array, moves: Array) -> Spread:
     Raises:
         RankError: no rows are left to estimate the noise from.
     """
-    statistics, columns = compressed.statistics, compressed.columns
     (n, l), root = columns.shape, statistics.root  # noqa: E741
     sensitivity = np.einsum("ij,jok->oik", root[:n, :n], moves[columns])
     parameters = float(np.sum(sensitivity**2))

@@ -124,7 +124,7 @@ class EquationError:
 
     def spread(self, z: np.ndarray, moves: np.ndarray) -> Spread:
         """Return the scatter under white equation errors, of a level of their own in every experiment if that shows."""
-        found = white_spread(self, z, moves)
+        found = white_spread(self.statistics, self.columns, z, moves)
         if found.penalised or self.parts is None:
             return found
         (n, l), parts = self.columns.shape, self.parts()  # noqa: E741

@@ -106,7 +106,7 @@ class CompressedErrors:
     def spread(self, z: Array, moves: Array) -> Spread:
         """Return the scatter under the noise that the errors show at z; where it is white, the factor tells it."""
         noise = self._noise(z, moves)
-        return self._sandwich(noise, moves) if noise.words else white_spread(self, z, moves)
+        return self._sandwich(noise, moves) if noise.words else white_spread(self.statistics, self.columns, z, moves)
 
     def _noise(self, z: Array, moves: Array) -> ErrorNoise:
         self._dof(moves)  # too few rows are refused first
