@@ -18,11 +18,11 @@ from optid.core.constraint import Constraint, largest_eigenvalue, symmetric_part
 from optid.core.leaves import LeafSpace
 from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, Length, NuclearNorms, Values, flat
-from optid.program.prices import ACTIVE
 from optid.program.sizes import relative_gradient, variable_size
 from optid.program.solution import Residuals
 from optid.structures.multipliers import fit_multipliers
 
+ACTIVE = 1e-6  # slack, relative to the size of the constraint's terms, below which it counts as active
 UNCONFIRMED = 1e-7  # stationarity above which multipliers fitted to the point are tried as well
 NOTHING = 1e-7  # share of the objective below which a part that has almost vanished counts as zero
 INSIDE = 1e-6  # distance from a bound of an unknown, relative to its size, within which it holds

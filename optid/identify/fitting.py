@@ -13,7 +13,7 @@ import numpy as np
 
 from optid.annotations import check_values
 from optid.bases import Linear, fitted_bases
-from optid.core.prices import price_constraints
+from optid.core.prices import Price, price_constraints
 from optid.core.problem import Problem
 from optid.core.program import Program
 from optid.data.record import Data, not_a_record
@@ -34,7 +34,6 @@ from optid.identify.parameters import Parameters, criteria, parameters, uncertai
 from optid.identify.record_checks import examine, examine_figures, without_outliers
 from optid.models.functions import has_feedback
 from optid.phrases import plural
-from optid.program.prices import Price
 from optid.program.solution import Bound, Solution, Status
 from optid.progress import log
 from optid.registry import Rendered, annotations, check_arguments, defaults, formulation, read_constraints

@@ -99,7 +99,7 @@ class Solution:
         reason: one sentence where the status needs one.
         values: {variable name: array} in the units of the programme, empty where there is no point; see `Fit.values`.
         duals: {constraint name: multiplier array} of the rows and the objective in units of the programme, empty
-            where the solver gives none; see `optid.program.prices`.
+            where the solver gives none; see `optid.core.prices`.
         objective: value of the programme's objective at ``values`` in units of the record, recomputed (``nan`` without
             a point).
         bound: certified lower bound, or None where the programme has no certificate.
