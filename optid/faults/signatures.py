@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,6 @@ from optid.faults.ranges import known_range
 from optid.faults.whitening import Predictor, predictor
 
 if TYPE_CHECKING:
-    from optid.faults.isolability import Isolability
     from optid.models import HammersteinSS
 
 ADDITIVE = ("bias", "drift", "jump", "spike")
@@ -224,12 +223,6 @@ class Dictionary:
                 into_state.append(begun * b)
                 into_output.append(on * d)
         return np.stack(into_state, axis=2), np.stack(into_output, axis=2)
-
-    def isolability(self, window: int = 100, **how: Any) -> "Isolability":
-        """Return the smallest detectable and isolable sizes; see `optid.faults.isolability.study`."""
-        from optid.faults.isolability import study
-
-        return study(self, window, **how)
 
     def __str__(self) -> str:
         """List the candidates, the groups and the excluded faults."""

@@ -10,10 +10,10 @@ from optid.data.record import Data
 from optid.data.timeline import Timeline
 from optid.errors import StructureError
 from optid.faults.diagnosis.alternatives import final_effect
-from optid.faults.diagnosis.answers import Answer, Certificate, Diagnosis, Estimate, Evidence
+from optid.faults.diagnosis.answers import Certificate, Diagnosis, Estimate, FaultAnswer, SearchEvidence
 from optid.faults.diagnosis.courses import LONGEST
 from optid.faults.diagnosis.posterior import estimates
-from optid.faults.diagnosis.ranking import NOTHING, Fit, explain_record
+from optid.faults.diagnosis.ranking import NOTHING, RankedExplanation, explain_record
 from optid.faults.diagnosis.record_search import Question, RecordSearch, search_record
 from optid.faults.diagnosis.records import (
     lost_sensors,
@@ -148,7 +148,8 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
         coverage=asked.coverage, method=asked.method,
         status=timeline.with_times(" ".join(note for note in notes if note)),
         model=model.title, outputs=model.outputs, dt=model.dt, remaining=remaining,
-        evidence=Evidence(white.r, white.present, fitted, seen.gains, () if search is None else search.labels, search),
+        evidence=SearchEvidence(white.r, white.present, fitted, seen.gains, () if search is None else search.labels,
+                                search),
         timeline=timeline, findings=record.findings,
     )
 
@@ -167,17 +168,17 @@ def _not_searched(seen: RecordSearch) -> dict[str, str]:
     return lost | {c.label: why for c in found.candidates if c.kind == "frozen" and model.l == 1}
 
 
-def _answers(seen: RecordSearch, fits: tuple[Fit, ...], stuck: tuple[Estimate, ...], timeline: Timeline
-             ) -> tuple[Answer, ...]:
+def _answers(seen: RecordSearch, fits: tuple[RankedExplanation, ...], stuck: tuple[Estimate, ...], timeline: Timeline
+             ) -> tuple[FaultAnswer, ...]:
     """Return the set of answers, each with the sensors that repeat one reading."""
     model, result = seen.dictionary.model, []
     if not fits and stuck:
-        return (Answer(tuple(_timed(fault, timeline) for fault in stuck), 1.0, float("inf")),)
+        return (FaultAnswer(tuple(_timed(fault, timeline) for fault in stuck), 1.0, float("inf")),)
     for fit in fits:
         faults = estimates(fit.explanation, seen.asked.coverage, len(fit.fitted), 2 * model.nx)
         faults = tuple(replace(one, effect=final_effect(model, one.name, one.size)) for one in faults)
         merged = sorted((*stuck, *faults), key=lambda fault: fault.onset)
-        result.append(Answer(tuple(_timed(fault, timeline) for fault in merged), fit.probability, fit.gain))
+        result.append(FaultAnswer(tuple(_timed(fault, timeline) for fault in merged), fit.probability, fit.gain))
     return tuple(result)
 
 

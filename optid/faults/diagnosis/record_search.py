@@ -10,9 +10,9 @@ import numpy as np
 from optid.arrays import Array, check_integer, check_probability
 from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError, nearest
-from optid.faults.consistency.leftover import alarm_probability, remainder_test
 from optid.faults.diagnosis.alternatives import with_unlisted_candidates
 from optid.faults.diagnosis.courses import courses, without_signature
+from optid.faults.diagnosis.leftover import alarm_probability, remainder_test
 from optid.faults.diagnosis.outliers import cleaned, with_spikes
 from optid.faults.diagnosis.posterior import Explanation
 from optid.faults.diagnosis.sensor_gains import sensor_gains

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.faults.monitor import file
 from optid.faults.monitor.actuator_kinds import searched
 from optid.faults.monitor.arl import Calibration, calibrate
 from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
@@ -133,7 +134,7 @@ class Monitor:
             f = self._simulate_reference(u) if inputs is None else inputs
             self.calibration = self._simulated(f, effect, arl0, samples=samples, extrapolate=extrapolate)
             if healthy is not None:
-                self.calibration = raise_thresholds(self, healthy, self.calibration)
+                self.calibration = raise_thresholds(self.calibration, found.model, healthy, self.watched)
         self._use(self.calibration)
         if isinstance(x0, str) and x0 == "unknown":
             self.plant.lose()
@@ -423,9 +424,7 @@ class Monitor:
 
     def save(self, path: str | Path) -> Path:
         """Write the state and the thresholds to an npz file, from which `load` continues bit for bit."""
-        from optid.faults.monitor.file import save
-
-        return save(self, path)
+        return file.save(self, path)
 
     @classmethod
     def load(cls, path: str | Path, functions: dict[str, Any] | None = None) -> "Monitor":
@@ -438,8 +437,6 @@ class Monitor:
         Raises:
             ModelFileError: truncated, of another version, or not the state of a monitor.
         """
-        from optid.faults.monitor.file import load
-
         monitor = cls.__new__(cls)
-        load(monitor, path, functions)
+        file.load(monitor, path, functions)
         return monitor

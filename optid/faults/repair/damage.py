@@ -14,7 +14,7 @@ from optid.faults.signatures import Candidate
 from optid.models.nonlinearity import Nonlinearity
 
 if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import Answer, Estimate
+    from optid.faults.diagnosis.answers import Estimate, FaultAnswer
     from optid.models import HammersteinSS
 
 DEAD_SHARE = 0.8
@@ -76,7 +76,7 @@ class Damage:
         )
 
 
-def damages(model: "HammersteinSS", answer: "Answer") -> list[Damage]:
+def damages(model: "HammersteinSS", answer: "FaultAnswer") -> list[Damage]:
     """Return one explanation of an answer, or one for each part of a group that is not isolable."""
     parts = [[(place, fault) for place in fault.candidate.places or (fault.name,)] for fault in answer.faults]
     variants = list(product(*parts))

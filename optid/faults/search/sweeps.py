@@ -37,7 +37,7 @@ ORDERS = {"drift": 1, "jump": 2, "spike": 2}
 """Where the columns of a kind stand: those that last, drifts, jumps."""
 
 
-class Tables(NamedTuple):
+class SweepTables(NamedTuple):
     """Input of the kernels of `optid.faults.search.sweep_kernels`.
 
     Attributes:
@@ -89,7 +89,7 @@ class Sweep:
     found: Dictionary
     white: Whitened
     u: Array | None
-    tables: Tables
+    tables: SweepTables
     roots: Array
     tested: np.ndarray
     along: Array
@@ -276,7 +276,7 @@ def inverse_roots(products: Array, largest: Array, share: float = SHARE) -> Arra
     return np.asarray(inverse[:, :, None] * np.swapaxes(axes, 1, 2))
 
 
-def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[bool, ...]) -> Tables:
+def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[bool, ...]) -> SweepTables:
     steady, window, l = white.predictor, len(white.r), found.model.l  # noqa: E741
     patterns, which = np.unique(white.present, axis=0, return_inverse=True)
     of = np.asarray(which, dtype=np.int64).ravel()
@@ -304,13 +304,13 @@ def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[boo
         first[i], dimensions[i] = begin, d
     places = np.concatenate([[0], np.cumsum(dimensions**2)[:-1]])
     helpers, drifting = (sum(candidates[i].dimension for i in part) for part in (lasting, drifts))
-    return Tables(
+    return SweepTables(
         of, compact(steady.A + gains @ steady.C), compact(steady.C), compact(whitening), compact(h), compact(e),
         helpers + drifting, drifting, helpers, np.repeat(line, sizes), first, dimensions, places,
     )
 
 
-def _with_schedules(found: Dictionary, white: Whitened, tables: Tables, u: Array | None) -> Tables:
+def _with_schedules(found: Dictionary, white: Whitened, tables: SweepTables, u: Array | None) -> SweepTables:
     """Append the states of one more predictor for every scheduled change: it has matrices of its own."""
     steady, n = white.predictor, found.model.nx
     chosen = [(i, c) for i, c in enumerate(found.candidates) if c.schedule is not None and tables.sizes[i]]
