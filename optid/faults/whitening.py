@@ -347,8 +347,8 @@ class Health:
         if not self.white:
             raise DataError(
                 f"The innovations of the healthy record are not white (p-value {p_value(self.p_value)}): thresholds "
-                "from this model would be wrong. Fit the model again, calibrate the thresholds on healthy records "
-                "(empirical_thresholds), or include the uncertainty of the identified model (model_uncertainty)."
+                "from this model would be wrong. Fit the model again, include the uncertainty of the identified "
+                "model (model_uncertainty), or watch with Monitor(..., healthy=record), which takes the noise from it."
             )
         if rescale:
             covariance = np.linalg.solve(steady.root, np.linalg.solve(steady.root, self.covariance).T)
