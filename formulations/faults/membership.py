@@ -133,13 +133,9 @@ def _proof_of(solution: Solution) -> ParityProof | None:
 
 def _between(candidate: Candidate, unit: Signature, first: int, last: int) -> Signature:
     """Basis that contains the signature for every onset in [first, last]; for last = N every time course."""
-    k, jump = np.arange(len(unit[0])), candidate.kind == "jump"
-    courses = [k == at for at in range(first, min(last + jump, k.size))]
-    if last < k.size and not jump:
-        ramp = candidate.kind == "drift"
-        courses += [np.maximum(k - last + 1, 0)] * ramp + [k >= last] * (not ramp or first < last)
-    shapes = np.array(courses, dtype=float)
-    state, output = (np.einsum("ck,kid->kicd", shapes, part).reshape(k.size, part.shape[1], -1) for part in unit)
+    count = len(unit[0])
+    shapes = np.array(candidate.fault_kind.courses(first, last, count), dtype=float)
+    state, output = (np.einsum("ck,kid->kicd", shapes, part).reshape(count, part.shape[1], -1) for part in unit)
     sizes = np.maximum(np.abs(state[1:]).max(axis=(0, 1), initial=0.0), np.abs(output).max(axis=(0, 1), initial=0.0))
     seen = sizes > 0
     return state[:, :, seen] / sizes[seen], output[:, :, seen] / sizes[seen]
@@ -180,10 +176,11 @@ def _posed(window: BoundedWindow, signature: Signature | None = None) -> Problem
 def _certified(window: BoundedWindow, signature: Signature | None, bounded: Array, exact: Array, bounds: Array,
                problem: Problem, values: Values, duals: Values) -> tuple[Bound, None]:
     """Return the factor that the parity vector near the multipliers proves."""
-    if np.size(duals.get("noise", ())) != 2 * bounded.size:
+    within = np.asarray(duals.get("noise", ()), dtype=float)
+    if within.size != 2 * bounded.size:
         return Bound.none("the solver gave no multipliers"), None
     weights = np.zeros(bounds.size)
-    upper, lower = np.split(np.asarray(duals["noise"], dtype=float), 2)
+    upper, lower = np.split(within, 2)
     weights[bounded] = (upper - lower) / bounds[bounded]
     if exact.size and np.size(duals.get("no noise", ())) == exact.size:
         weights[exact] = np.asarray(duals["no noise"], dtype=float)

@@ -168,7 +168,7 @@ def isolability(
     matrix = np.array([[_crossing(p, prob, draws) for p in row] for row in preferred]) / unit[:, None]
     isolable = np.array([_crossing(p, prob, draws) for p in isolated])
     detectable = np.array([_crossing(p, prob, draws) for p in detected])
-    whole = np.array([1.0 if c.kind == "loss" else np.inf for c in candidates])  # largest possible size
+    whole = np.array([c.fault_kind.largest for c in candidates])  # largest possible size
     sizes = [np.where(d / unit > whole, np.inf, d / unit) for d in (detectable, isolable)]
     labels = tuple(c.label for c in candidates)
     rivals = []

@@ -67,7 +67,7 @@ def _cards(found: Diagnosis) -> Facts:
 
 def _facts(found: Diagnosis) -> Facts:
     facts = [("Method", found.method), ("False alarms", f"{found.false_alarm:g} of healthy records"), _p_value(found)]
-    if found.certificate.kind != "none":
+    if found.certificate.basis != "none":
         facts.append(("Proof", words.certificate_words(found).removeprefix("proof: ")))
     if found.remaining is not None:
         facts.append(("Left unexplained", words.remaining_words(found).removeprefix("left unexplained: ")))

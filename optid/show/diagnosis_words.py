@@ -6,15 +6,10 @@ import numpy as np
 
 from optid.data.description import listed_findings
 from optid.faults.diagnosis.answers import Diagnosis, Estimate
+from optid.faults.kinds import kind_of
 from optid.phrases import p_value
 
 WIDTH = 80
-
-WORDS = {
-    "drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading", "saturated": "reading",
-    "schedule": "share of the change",
-}
-"""Name of the magnitude of a kind."""
 
 HEADLINES = {
     "healthy": "no alarm",
@@ -66,15 +61,7 @@ def size_words(fault: Estimate) -> list[str]:
 
 def magnitude_names(fault: Estimate) -> list[str]:
     """Return the names of the entries of the size."""
-    d = len(fault.size)
-    if fault.kind in ("loss", "stuck"):
-        constants = ["constant added"] if d == 2 else [f"constant added to function {i}" for i in range(1, d)]
-        return ["share lost", *constants]
-    word = WORDS.get(fault.kind, "size")
-    if d == 1:
-        return [word]
-    part = "state" if fault.name.startswith(("state", "process")) else "part"
-    return [f"{word} of {part} {i}" for i in range(1, d + 1)]
+    return kind_of(fault.kind).size_names(fault.name, len(fault.size))
 
 
 def printed(found: Diagnosis) -> str:
@@ -90,7 +77,7 @@ def printed(found: Diagnosis) -> str:
         lines += ["", f"probability {answer.posterior:.3f}, gain {answer.gain:.1f}{mark}"]
         lines += [f"  {line}" for line in str(answer).splitlines()]
     if found.detected:
-        lines += ["", certificate_words(found)] if found.certificate.kind != "none" else [""]
+        lines += ["", certificate_words(found)] if found.certificate.basis != "none" else [""]
     if found.remaining is not None:
         lines += [remaining_words(found)]
     lines += [f"untestable: {label}, {why}" for label, why in found.untestable.items()]
@@ -123,17 +110,17 @@ def headline(found: Diagnosis) -> str:
 def certificate_words(found: Diagnosis) -> str:
     """State the certificate."""
     proof = found.certificate
-    if proof.kind in ("exhaustive", "grid"):
-        tried = "every candidate and onset was tried" if proof.kind == "exhaustive" else "a grid of onsets was tried"
+    if proof.basis in ("exhaustive", "grid"):
+        tried = "every candidate and onset was tried" if proof.basis == "exhaustive" else "a grid of onsets was tried"
         words = f"proof: {tried}; energy explained beyond its threshold {proof.value:.1f}"
         if np.isfinite(proof.runner_up_margin):
             words += f", twice the log-odds against the runner-up {proof.runner_up_margin:.1f}"
         return words
-    if proof.kind == "flat line":
+    if proof.basis == "flat line":
         return f"proof: {proof.value:.0f} readings in a row are identical or missing"
-    if proof.kind == "duality gap":
+    if proof.basis == "duality gap":
         return f"proof: duality gap {proof.value:.1e}"
-    if proof.kind == "infeasible healthy":
+    if proof.basis == "infeasible healthy":
         return (
             f"proof: no healthy course lies within the bounds of the noise unless they are {proof.value:.3g} times as "
             "wide; the parity vector is kept"

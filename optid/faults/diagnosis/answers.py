@@ -113,19 +113,29 @@ class Certificate:
     """Evidence that the best answer is the best.
 
     Attributes:
-        kind: "exhaustive" (every candidate and onset was tried), "grid" (every candidate at some onsets), "duality gap"
-            (of a convex programme), "infeasible healthy" (no healthy record within the bounds of the noise), "flat
+        basis: "exhaustive" (every candidate and onset was tried), "grid" (every candidate at some onsets), "duality
+            gap" (of a convex programme), "infeasible healthy" (no healthy record within the bounds of the noise), "flat
             line" (identical readings), or "none".
         value: energy explained beyond the threshold, duality gap, the least factor of the bounds of the noise, or the
             number of identical readings.
         runner_up_margin: twice the log-odds of the best answer against the next one; inf where there is no other.
-        parity_vector: (N, l) multipliers of the proof "infeasible healthy"; None for the other kinds.
+        parity_vector: (N, l) multipliers of the proof "infeasible healthy"; None without it.
     """
 
-    kind: str
+    basis: str
     value: float
     runner_up_margin: float = float("inf")
     parity_vector: Array | None = None
+
+    @property
+    def proved(self) -> bool:
+        """Whether there is evidence."""
+        return self.basis != "none"
+
+    @property
+    def excludes_health(self) -> bool:
+        """Whether it proves that no healthy plant made the record."""
+        return self.parity_vector is not None
 
 
 @dataclass(frozen=True, eq=False)

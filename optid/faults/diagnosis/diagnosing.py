@@ -128,21 +128,21 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
         notes.append("With one output only faults with a known course are isolable.")
     timeline = record.timelines[number]
     answers = _answers(seen, fits, stuck, timeline)
-    certificate = ranking.certificate if fits or ranking.certificate.kind == "infeasible healthy" else NOTHING
+    certificate = ranking.certificate if fits or ranking.certificate.excludes_health else NOTHING
     if stuck and not fits:
         certificate = Certificate("flat line", float(max(line.count for line in lines)))
     remaining = None
     if alarm:
         remaining = ranking.fits[0].remaining if ranking.fits else seen.healthy
     verdict = "untestable" if seen.lost and not seen.tested else "unknown" if alarm else "healthy"
-    if alarm and model.l == 1 and any(c.kind == "frozen" for c in seen.dictionary.candidates):
+    if alarm and model.l == 1 and any(c.fault_kind.waveform for c in seen.dictionary.candidates):
         verdict = "not isolable"
     white, search = seen.whitened, seen.search
     fitted = fits[0].fitted if fits else np.zeros_like(white.r)
     return Diagnosis(
         verdict="faulty" if stuck or fits else verdict,
         detected=bool(alarm or stuck),
-        best=answers[0] if answers and certificate.kind != "none" else None, candidates=answers,
+        best=answers[0] if answers and certificate.proved else None, candidates=answers,
         p_value=0.0 if stuck else first.p_value, certificate=certificate,
         untestable=dict(seen.lost) | _not_searched(seen), window=len(white.r), false_alarm=asked.false_alarm,
         coverage=asked.coverage, method=asked.method,
@@ -160,12 +160,13 @@ def _not_searched(seen: RecordSearch) -> dict[str, str]:
     lost: dict[str, str] = {}
     if model.feedback or np.any(model.L):
         why = "the model feeds readings back into its state, so that a faulty one changes the plant"
-        lost = {c.label: why for c in found.candidates if c.kind == "loss" and not c.columns}
+        lost = {c.label: why for c in found.candidates if c.is_sensor_gain}
     if seen.whitened.r.size > LONGEST:
         why = f"the record has more than {LONGEST} readings, too many for this kind: cut it"
-        return lost | {c.label: why for c in found.candidates if c.kind in ("frozen", "noise")}
+        return lost | {c.label: why for c in found.candidates
+                       if c.fault_kind.waveform or c.fault_kind.noise}
     why = "with one output a fault of arbitrary course explains every record"
-    return lost | {c.label: why for c in found.candidates if c.kind == "frozen" and model.l == 1}
+    return lost | {c.label: why for c in found.candidates if c.fault_kind.waveform and model.l == 1}
 
 
 def _answers(seen: RecordSearch, fits: tuple[RankedExplanation, ...], stuck: tuple[Estimate, ...], timeline: Timeline

@@ -133,7 +133,7 @@ def _exact(seen: RecordSearch, count: int) -> Ranking:
     note = "" if exhaustive else "Two faults were searched on a grid of onsets."
     if not ranking.fits:
         return ranking._replace(note=note)
-    on_grid = any(c.kind == "noise" for c in ranking.fits[0].explanation.candidates)  # whose onsets are sampled
+    on_grid = any(c.fault_kind.noise for c in ranking.fits[0].explanation.candidates)  # whose onsets are sampled
     kind = "exhaustive" if exhaustive and not on_grid else "grid"
     return ranking._replace(certificate=Certificate(kind, ranking.fits[0].gain, ranking.odds), note=note)
 

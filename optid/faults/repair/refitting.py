@@ -19,7 +19,7 @@ from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.faults.repair.curves import Curve, curve_of
 from optid.faults.repair.damage import Damage
-from optid.faults.signatures import Candidate, course_of
+from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor, predictor, whiten
 from optid.models.experiments import in_units_of
 from optid.models.nonlinearity import Nonlinearity
@@ -271,7 +271,7 @@ class Refitting:
         later = states @ model.A.T + f @ model.B.T + model.offset_x + w.fed
         outputs = states @ model.C.T + f @ model.D.T + model.offset_y
         for c in self.offsets:
-            course, size = course_of(c.kind, w.since), values[f"size[{c.label}]"]
+            course, size = c.fault_kind.progress(w.since), values[f"size[{c.label}]"]
             later[:-1] += np.outer(course[1:], c.into_state @ size)
             outputs += np.outer(course, c.into_output @ size)
         return later, outputs

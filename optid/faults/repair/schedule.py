@@ -154,7 +154,7 @@ def _plant(problem: Refitting, theta: Array) -> "HammersteinSS":
     """Return the model of a refit, with what the faults add at the end of the record."""
     model = problem.model_at(theta)
     for c in problem.offsets:
-        last = 1.0 if c.kind != "drift" else float(len(problem.windows[0].u) - int(problem.windows[0].held))
+        last = float(c.fault_kind.progress(problem.windows[0].since)[-1])
         size = problem.unpack(theta)[f"size[{c.label}]"]
         model = replace(model, offset_x=model.offset_x + c.into_state @ (last * size))
     return model

@@ -19,7 +19,8 @@ import numpy as np
 
 from optid.arrays import Array, compact
 from optid.errors import DataError, StructureError
-from optid.faults.faults import matrices_of
+from optid.faults.kinds import DRIFT, JUMP
+from optid.faults.places import matrices_of
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened
 from optid.models.experiments import samples_of
@@ -32,9 +33,6 @@ BATCH = 2_000_000
 
 SMALL = 10_000
 """Products of columns up to which a single run takes less time than to compile it."""
-
-ORDERS = {"drift": 1, "jump": 2, "spike": 2}
-"""Where the columns of a kind stand: those that last, drifts, jumps."""
 
 
 class SweepTables(NamedTuple):
@@ -283,9 +281,9 @@ def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[boo
     gains = np.where(patterns[:, None, :], -steady.K, steady.L)
     whitening = np.stack([steady.whitened(np.eye(l)[None], pattern[None])[0] for pattern in patterns])
     candidates = found.candidates
-    lasting, drifts, jumps = (
-        [i for i, a in enumerate(able) if a and ORDERS.get(candidates[i].kind, 0) == order] for order in range(3)
-    )
+    tested = [i for i, a in enumerate(able) if a]
+    drifts, jumps = ([i for i in tested if candidates[i].fault_kind.course == course] for course in (DRIFT, JUMP))
+    lasting = [i for i in tested if i not in drifts and i not in jumps]
     line = lasting + drifts + drifts + jumps  # the helpers of the drifts are the last of the columns that last
     into = [
         found.additions(c, window, 0, u) if c.columns else (c.into_state[None], c.into_output[None])
