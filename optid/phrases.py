@@ -19,3 +19,8 @@ def p_value(p: float, digits: int = 2, missing: str = "-") -> str:
 def p_equals(p: float, digits: int = 2) -> str:
     """Write "p = 0.03", or "p < 1e-16"."""
     return f"p {p_value(p, digits)}" if p < SMALLEST else f"p = {p_value(p, digits)}"
+
+
+def short(text: str, most: int = 120) -> str:
+    """Cut a text to so many characters, the last of them an ellipsis."""
+    return text if len(text) <= most else text[: most - 1] + "…"

@@ -486,13 +486,13 @@ def test_the_first_command_of_the_readme(tmp_path):
 @pytest.fixture
 def short_ladder(monkeypatch):
     from optid.identify.search.ladder import KINDS, LINEAR, RUNGS
-    from optid.identify.search.trial import Candidate
+    from optid.identify.search.trial import StructureCandidate
 
     for kind in KINDS:
         monkeypatch.setitem(RUNGS, kind, lambda ladder: iter(()))
 
     def lines(ladder):
-        yield [Candidate(LINEAR, "arx", {"na": na, "nb": 2}) for na in (1, 2)]
+        yield [StructureCandidate(LINEAR, "arx", {"na": na, "nb": 2}) for na in (1, 2)]
 
     monkeypatch.setitem(RUNGS, LINEAR, lines)
 

@@ -66,7 +66,7 @@ def test_offsets_are_named_with_their_onset_and_size(found, limits, fault, label
     assert named.onset_interval[0] <= 60 <= named.onset_interval[1] and abs(named.onset - 60) <= 3
     low, high = named.size_interval[0]
     assert low < size < high and high - low < 1.2 * abs(size)
-    assert answer.certificate.kind == "exhaustive" and answer.certificate.value > 0
+    assert answer.certificate.basis == "exhaustive" and answer.certificate.value > 0
     assert answer.remaining.p_value > 1e-3
     assert sum(a.posterior for a in answer.candidates) <= 1 + 1e-12
 
@@ -98,7 +98,7 @@ def test_a_healthy_record_is_healthy_with_a_p_value(found, limits):
     assert np.sum(p_values <= 0.01) <= 3 and p_values.max() > 0.3
     healthy = next(answer for answer in answers if answer.verdict == "healthy")
     assert healthy.best is None and healthy.candidates == () and not healthy.detected and healthy.onset is None
-    assert "healthy" in healthy.explain() and healthy.certificate.kind == "none" and not healthy.unique
+    assert "healthy" in healthy.explain() and healthy.certificate.basis == "none" and not healthy.unique
 
 
 @pytest.mark.slow
@@ -161,7 +161,7 @@ def test_a_sensor_that_repeats_its_reading_is_a_finding_and_the_rest_is_judged(f
     u, y = record(Fault.frozen("sensor:y1", 70))
     answer = diagnose(small(), (u, y), found)
     assert answer.verdict == "faulty" and answer.best.labels == ("sensor:y1 frozen",) and answer.onset == 70
-    assert answer.size[0] == y[70, 0] and answer.certificate.kind == "flat line"
+    assert answer.size[0] == y[70, 0] and answer.certificate.basis == "flat line"
     assert "are identical" in str(answer)
     u, y = record(Fault.frozen("sensor:y1", 70), Fault.step("sensor:y2", 40, 0.8))
     both = diagnose(small(), (u, y), found)
@@ -302,7 +302,7 @@ def test_the_programme_and_the_exact_search_agree(found, limits, method):
     data = record(Fault.step("sensor:y2", 40, 0.9), Fault.step("actuator:u1", 80, 0.9))
     exact = diagnose(small(), data, found, thresholds=limits, max_faults=2)
     found_so = diagnose(small(), data, found, thresholds=limits, max_faults=2, method=method)
-    assert found_so.method == method and found_so.certificate.kind == "duality gap"
+    assert found_so.method == method and found_so.certificate.basis == "duality gap"
     assert found_so.certificate.value < 1e-6
     assert set(found_so.best.labels) == set(exact.best.labels)
 
@@ -323,12 +323,12 @@ def test_an_answer_without_a_certificate_is_not_called_the_best(found, limits):
 def test_bounds_of_the_noise_prove_a_large_fault_and_not_health(found, limits):
     data = record(Fault.step("sensor:y2", 50, 3.0))
     answer = diagnose(small(), data, found, thresholds=limits, method="set")
-    assert answer.certificate.kind == "infeasible healthy" and answer.certificate.value > 1
+    assert answer.certificate.basis == "infeasible healthy" and answer.certificate.value > 1
     assert answer.certificate.parity_vector.shape == (COUNT, 2) and "sensor:y2" in [a.label for a in answer.candidates]
     calm = diagnose(small(), record(), found, thresholds=limits, method="set")
     assert calm.verdict == "healthy" and "No proof" in calm.status
     faint = diagnose(small(), record(Fault.step("sensor:y2", 50, 0.7)), found, thresholds=limits, method="set")
-    assert faint.verdict == "faulty" and faint.certificate.kind == "exhaustive" and "No proof" in faint.status
+    assert faint.verdict == "faulty" and faint.certificate.basis == "exhaustive" and "No proof" in faint.status
 
 
 # -- edges of the record -------------------------------------------------------------------------------------------

@@ -14,9 +14,9 @@ from scipy.stats import norm
 from test_fault_injection import small
 
 from optid.errors import ModelFileError, StructureError
-from optid.faults import Answer, Certificate, Diagnosis, Estimate, dictionary, load_diagnosis, scan, thresholds
-from optid.faults.consistency.leftover import alarm_probability, remainder_test
+from optid.faults import Certificate, Diagnosis, Estimate, FaultAnswer, dictionary, load_diagnosis, scan, thresholds
 from optid.faults.diagnosis.answers import Remaining
+from optid.faults.diagnosis.leftover import alarm_probability, remainder_test
 from optid.faults.diagnosis.posterior import (
     SPREADS,
     marginal,
@@ -210,7 +210,7 @@ def example(kind="loss", **changes):
     candidate = dictionary(small(), kinds=["bias", "loss"])["actuator:u1 loss"]
     fault = Estimate(candidate.label, candidate.name, kind, candidate, 100, (98, 103), False, np.array([0.5]),
                      np.array([[0.4, 1.1]]), np.array([[0.01]]), 12.0)
-    answer = Answer((fault,), 0.97, 101.25)
+    answer = FaultAnswer((fault,), 0.97, 101.25)
     how = dict(
         verdict="faulty", detected=True, best=answer, candidates=(answer,), p_value=1e-12,
         certificate=Certificate("exhaustive", 101.25, float("inf")), untestable={"actuator:u2 loss": "no excitation"},
@@ -233,7 +233,7 @@ def test_a_saved_diagnosis_is_read_back_to_the_last_bit(tmp_path):
 
 def test_numbers_that_json_does_not_know_survive(tmp_path):
     fault = replace(example().best.faults[0], size=np.array([np.nan]), size_interval=np.array([[-np.inf, np.inf]]))
-    answer = Answer((fault,), 1.0, float("inf"))
+    answer = FaultAnswer((fault,), 1.0, float("inf"))
     again = load_diagnosis(example(best=answer, candidates=(answer,)).save(tmp_path / "d.json"))
     assert np.isnan(again.size[0]) and again.size_interval[0].tolist() == [-np.inf, np.inf]
     vector = np.arange(6.0).reshape(3, 2)

@@ -21,7 +21,6 @@ from optid.faults import (
     allocate,
     dictionary,
     membership,
-    noise_covariance,
     profile,
     scan,
     signature_estimate,
@@ -163,11 +162,6 @@ def course(prior, **how):
             prior, **how)
 
 
-def covariance(**how):
-    found, window = searched(Fault.sensor_noise("sensor:y1", 10, scale=3.0), 40, kinds=["bias", "noise"])
-    noise_covariance(found, window.whitened, **how)
-
-
 def refit(state, **how):
     healthy = plant()
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), seed=1, count=ONSET + 30)
@@ -177,8 +171,8 @@ def refit(state, **how):
 FAULTS = {
     "signature": signature, "course": lambda: course("tv"), "course, sign": lambda: course("tv", sign="positive"),
     "signature, sign": lambda: signature(constraints=[lambda view: {"above": view["a[sensor:y1]"] >= 0.0}]),
-    "trend": lambda: course("trend"), "walk": lambda: course("smooth"), "covariance": covariance,
-    "full covariance": lambda: covariance(form="full"), "refit": lambda: refit(actuator),
+    "trend": lambda: course("trend"), "walk": lambda: course("smooth"),
+    "refit": lambda: refit(actuator),
     "refit, free": lambda: refit(actuator, constraints=[]), "parameters": lambda: refit(parameters),
     "membership": lambda: membership(small(), record(small(), 1, (), 0.0, 40), 3.0),
     "allocation": lambda: allocate(plant()).attainable([1.0, 1.0]),

@@ -43,7 +43,7 @@ def test_the_onset_of_grown_noise_has_an_interval_that_holds_it():
         u = levels(200, seed)
         y = inject(model, u, [Fault.sensor_noise("sensor:y2", onset, scale=6)], seed=seed)
         answer = diagnose(model, (u, y), found)
-        assert answer.verdict == "faulty" and answer.certificate.kind == "grid"
+        assert answer.verdict == "faulty" and answer.certificate.basis == "grid"
         (fault,) = answer.best.faults
         assert fault.kind == "noise" and abs(fault.onset - onset) < 15
         low, high = fault.onset_interval

@@ -69,7 +69,7 @@ def test_innovations_that_are_not_white_are_refused():
     other = replace(model, A=model.A - 0.25 * np.eye(3))
     steady, found = predictor(other), health(whiten(other, Data(u, inject(model, u))))
     assert found.p_value < 1e-3
-    with pytest.raises(DataError, match="not white.*empirical.*model_uncertainty"):
+    with pytest.raises(DataError, match="not white.*model_uncertainty.*healthy"):
         found.predictor(steady, rescale=True)
 
 

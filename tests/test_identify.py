@@ -32,7 +32,7 @@ from optid.identify.search.trial import (
     KINDS,
     LATENT,
     LINEAR,
-    Candidate,
+    StructureCandidate,
     Trial,
     free_parameters,
     tried,
@@ -60,11 +60,11 @@ def short(monkeypatch):
     """A ladder of a few structures."""
 
     def lines(ladder):
-        yield [Candidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}),
-               Candidate(LINEAR, "oe.exact", {"na": 1, "nb": 1, "nk": [1]})]
+        yield [StructureCandidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}),
+               StructureCandidate(LINEAR, "oe.exact", {"na": 1, "nb": 1, "nk": [1]})]
 
     def functions(ladder):
-        yield [Candidate(INPUTS, "hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": [1], "basis": basis})
+        yield [StructureCandidate(INPUTS, "hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": [1], "basis": basis})
                for basis in ("polynomial:3", "triangular:4")]
 
     monkeypatch.setitem(RUNGS, LINEAR, lines)
@@ -206,22 +206,23 @@ def test_errors_of_smaller_structures_are_those_of_fits_without_the_blocks():
 def test_a_trial_is_given_up_early_and_says_why():
     data = plant(400, cubic=0.5)
     blocks = Blocks.of(data)
-    good = tried(Candidate(INPUTS, "hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": [1], "basis": "polynomial:3"}),
+    good = tried(StructureCandidate(INPUTS, "hammerstein_oe.exact",
+                                    {"na": 1, "nb": 1, "nk": [1], "basis": "polynomial:3"}),
                  blocks, None, {}, (), None)
     assert good.complete and good.score > 95 and len(good.by_block) == 4 and good.parameters == 5
-    poor = tried(Candidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, good, {}, (), None)
+    poor = tried(StructureCandidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, good, {}, (), None)
     assert not poor.complete and "below the cross-validated fit of the best" in poor.reason and poor.score == -np.inf
     late = tried(good.candidate, blocks, good, {}, (), None, 1e-3)
     assert late.reason == "out of time"
-    refused = tried(Candidate(LINEAR, "arx", {"na": 300, "nb": 300}), blocks, None, {}, (), None)
+    refused = tried(StructureCandidate(LINEAR, "arx", {"na": 300, "nb": 300}), blocks, None, {}, (), None)
     assert refused.reason.startswith("RankError") and refused.status == "refused"
 
 
 def test_a_richer_structure_that_follows_the_record_no_better_is_not_cross_validated():
     data = plant(400, noise=0.05)
     blocks = Blocks.of(data)
-    plain = tried(Candidate(LINEAR, "oe.exact", {"na": 1, "nb": 1, "nk": [1]}), blocks, None, {}, (), None)
-    rich = Candidate(INPUTS, "hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": [1], "basis": "polynomial:3"})
+    plain = tried(StructureCandidate(LINEAR, "oe.exact", {"na": 1, "nb": 1, "nk": [1]}), blocks, None, {}, (), None)
+    rich = StructureCandidate(INPUTS, "hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": [1], "basis": "polynomial:3"})
     found = tried(rich, blocks, plain, {}, (), None)
     assert found.fits == 1 and "less error energy than the best linear model" in found.reason
     assert found.estimation > plain.estimation
@@ -235,7 +236,7 @@ def test_functions_keep_the_range_of_the_record_where_a_block_is_left_out():
     y = np.convolve(u + 0.5 * u**3, 0.8 ** np.arange(60))[:800]
     blocks = Blocks.of(optid.Data(u, y + 0.01 * rng.normal(size=800)))
     arguments = {"na": 1, "nb": 1, "basis": "polynomial:3"}
-    found = tried(Candidate(INPUTS, "hammerstein_oe.exact", arguments), blocks, None, {}, (), None)
+    found = tried(StructureCandidate(INPUTS, "hammerstein_oe.exact", arguments), blocks, None, {}, (), None)
     assert found.by_block.min() > 98
     narrow = optid.fit(blocks.without(3), "hammerstein_oe.exact", **arguments).model
     energy, measure = blocks.errors(narrow, 3)
@@ -256,7 +257,7 @@ def test_fits_without_a_block_go_on_from_the_whole_record(formulation, arguments
         x[k] = 0.7 * x[k - 1] - 0.1 * np.tanh(x[k - 1]) ** 3 + u[k - 1]
     y = x + 0.2 * x**2 if formulation == "wiener_ss.exact" else x
     blocks = Blocks.of(optid.Data(3 + 2 * u, 40 + 7 * y + 0.05 * rng.normal(size=600)))
-    found = tried(Candidate(LATENT, formulation, {"nx": 1, **arguments}), blocks, None, {}, (), None)
+    found = tried(StructureCandidate(LATENT, formulation, {"nx": 1, **arguments}), blocks, None, {}, (), None)
     assert found.complete, found.reason
     cold = [optid.fit(blocks.without(b), formulation, nx=1, prove=False, **arguments).model for b in range(4)]
     errors = np.array([blocks.errors(model, b)[0] for b, model in enumerate(cold)])
@@ -290,7 +291,7 @@ def test_a_better_optimum_without_a_block_is_where_the_whole_fit_goes_on(monkeyp
     """Functions of latent signals have many optima; what is chosen is fitted in the same way."""
     data = plant(400)
     good = optid.fit(data, "hammerstein_ss.sid", nx=1, basis="linear")
-    candidate, blocks = Candidate(LATENT, "lfr.exact", {"nx": 1, "channels": 1}), Blocks.of(data)
+    candidate, blocks = StructureCandidate(LATENT, "lfr.exact", {"nx": 1, "channels": 1}), Blocks.of(data)
     calls = stuck_on_the_whole(monkeypatch, trying, blocks.data, good, before)
     found = tried(candidate, blocks, None, {}, (), None)
     order = (*blocks.moving[::2], *blocks.moving[1::2])
@@ -318,7 +319,7 @@ def test_free_parameters_are_counted_without_those_that_repeat_others(formulatio
 
 def trial(kind, energies, parameters=3):
     energy = np.array(energies, dtype=float)[:, None]
-    candidate = Candidate(kind, f"of {kind}", {"n": parameters})
+    candidate = StructureCandidate(kind, f"of {kind}", {"n": parameters})
     return Trial(candidate, 99.0, energy, np.ones_like(energy), tuple(range(len(energy))), parameters, 5, 5, 0.1,
                  "optimal")
 
@@ -620,12 +621,12 @@ def test_a_model_that_leaves_the_range_when_the_inputs_come_otherwise_is_dropped
     run, y = fit.model.simulate(u, x0=state)[400:], data.y
     expected = max(y.min() - run.min(), run.max() - y.max()) / (y.max() - y.min())
     assert blocks.excursion(fit.model) == pytest.approx(max(expected, 0.0), abs=1e-12)
-    candidate = Candidate(LATENT, "wiener_ss.exact", {"nx": 1, "output_basis": "polynomial:3"})
+    candidate = StructureCandidate(LATENT, "wiener_ss.exact", {"nx": 1, "output_basis": "polynomial:3"})
     assert tried(candidate, blocks, None, {}, (), None).complete
     monkeypatch.setattr(Blocks, "excursion", lambda *_: 0.6)
     assert "leaves the range of the outputs" in tried(candidate, blocks, None, {}, (), None).reason
     assert tried(candidate, blocks, None, {}, (), 1).complete  # predictions do not run freely
-    assert tried(Candidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, None, {}, (), None).complete
+    assert tried(StructureCandidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, None, {}, (), None).complete
 
 
 def test_functions_of_states_have_one_level_for_all_experiments():
@@ -634,4 +635,4 @@ def test_functions_of_states_have_one_level_for_all_experiments():
     assert ladder.levels_differ
     for kind, formulation, word in ((LINEAR, "oe.exact", "each"), (INPUTS, "hammerstein_oe.exact", "each"),
                                     (LATENT, "wiener_ss.exact", None), (FEEDBACK, "hammerstein_ss.exact", None)):
-        assert ladder.levelled(Candidate(kind, formulation, {"nx": 2})).arguments.get("offset") == word
+        assert ladder.levelled(StructureCandidate(kind, formulation, {"nx": 2})).arguments.get("offset") == word

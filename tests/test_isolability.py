@@ -14,9 +14,8 @@ from typer.testing import CliRunner
 from optid import Data
 from optid.cli.app import app
 from optid.errors import DataError, LookupFailed, StructureError
-from optid.faults import Fault, dictionary, inject, whiten
-from optid.faults.isolability import GRID, MIDDLE
-from optid.faults.isolability_page import write
+from optid.faults import Fault, dictionary, inject, isolability, whiten
+from optid.faults.isolability_study import GRID, MIDDLE
 from optid.faults.search.calibration import family_thresholds
 from optid.faults.search.sweeps import sweep
 
@@ -30,12 +29,12 @@ def found():
 def standard_study(real_data):
     model, load = standard(real_data)
     faults = dictionary(model, process={"load": load})
-    return model, load, faults, faults.isolability(100)
+    return model, load, faults, isolability(faults, 100)
 
 
 def test_one_candidate_with_a_known_onset_has_the_law_of_chi_square():
     alone = dictionary(small(), actuators=[], sensors=["y1"], state_jump=False)
-    study = alone.isolability(60, onset=30, draws=20_000, calibration=100_000, false_alarm=0.01)
+    study = isolability(alone, 60, onset=30, draws=20_000, calibration=100_000, false_alarm=0.01)
     limit = chi2.isf(0.01, 1)
     assert abs(study.thresholds[0] / limit - 1) < 0.03
     d = np.array([1.0, 2.0, 3.0, 5.0])
@@ -51,7 +50,7 @@ def test_two_rivals_at_a_known_onset_follow_the_formula():
     """Far above the threshold the right one of two wins when noise does not bridge half the distance between them."""
     near = small().B[:, 0] + [0.1, 0.25, -0.1]
     both = dictionary(small(), actuators=["u1"], sensors=[], process={"near": near}, state_jump=False)
-    study = both.isolability(60, onset=20, draws=20_000, calibration=20_000)
+    study = isolability(both, 60, onset=20, draws=20_000, calibration=20_000)
     from scipy.stats import norm
 
     sine = study.sines[0, 1]
@@ -117,7 +116,7 @@ def test_the_forecast_meets_records_of_the_plant(standard_study, label):
 
 @pytest.mark.slow
 def test_a_longer_window_helps_a_lasting_fault_and_not_a_transient_one(found):
-    short, long = found.isolability(40, calibration=5000), found.isolability(120, calibration=5000)
+    short, long = isolability(found, 40, calibration=5000), isolability(found, 120, calibration=5000)
     assert long.detectable[0] < 0.8 * short.detectable[0]
     assert abs(long.detectable[-1] / short.detectable[-1] - 1) < 0.15 and long.bounded[-1]
 
@@ -127,7 +126,7 @@ def test_faults_that_no_record_tells_apart_are_one_row():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         merged = dictionary(model, process={"same": model.B[:, 0]})
-    study = merged.isolability(40, calibration=5000, draws=300)
+    study = isolability(merged, 40, calibration=5000, draws=300)
     assert study.ambiguity_groups == [("actuator:u1", "process:same")]
     assert np.isfinite(study.isolable).all() and "not isolable from each other: actuator:u1, process:same" in str(study)
 
@@ -135,7 +134,7 @@ def test_faults_that_no_record_tells_apart_are_one_row():
 def test_one_output_cannot_tell_all_apart_at_any_size():
     """With one output and no noise in the state, a step behind one filter is told from others by its course alone."""
     model = noisy([[0.5]], [[1.0]], [[1.0]], [[0.04]], [[0.01]])
-    study = dictionary(model).isolability(40, calibration=5000, draws=500)
+    study = isolability(dictionary(model), 40, calibration=5000, draws=500)
     assert study.labels == ("actuator:u", "sensor:y", "state")
     assert np.all(study.isolable > study.detectable)
 
@@ -143,7 +142,7 @@ def test_one_output_cannot_tell_all_apart_at_any_size():
 @pytest.mark.slow
 def test_it_prints_within_80_columns_and_draws(standard_study, found, tmp_path):
     _, _, _, study = standard_study
-    wide = found.isolability(40, calibration=5000, draws=200)
+    wide = isolability(found, 40, calibration=5000, draws=200)
     for one in (study, wide):
         assert max(map(len, str(one).splitlines())) <= 80
         figure = one.plot()
@@ -155,18 +154,18 @@ def test_it_prints_within_80_columns_and_draws(standard_study, found, tmp_path):
 
 def test_bad_input(found):
     refused(
-        (StructureError, "at least 8 samples", lambda: found.isolability(7)),
-        (StructureError, "prob=", lambda: found.isolability(40, prob=1.0)),
-        (StructureError, "false_alarm=", lambda: found.isolability(40, false_alarm=0.0)),
-        (DataError, "at least 50000000 draws", lambda: found.isolability(40, false_alarm=1e-6)),
-        *((StructureError, "onset=", lambda k=k: found.isolability(40, onset=k)) for k in ("middle", 40, -1)),
-        (StructureError, "draws must be a positive integer; got 0", lambda: found.isolability(draws=0)),
-        (StructureError, "calibration must be a positive", lambda: found.isolability(calibration=0.5)),
-        (StructureError, "fit in memory", lambda: found.isolability(10**8)),
+        (StructureError, "at least 8 samples", lambda: isolability(found, 7)),
+        (StructureError, "prob=", lambda: isolability(found, 40, prob=1.0)),
+        (StructureError, "false_alarm=", lambda: isolability(found, 40, false_alarm=0.0)),
+        (DataError, "at least 50000000 draws", lambda: isolability(found, 40, false_alarm=1e-6)),
+        *((StructureError, "onset=", lambda k=k: isolability(found, 40, onset=k)) for k in ("middle", 40, -1)),
+        (StructureError, "draws must be a positive integer; got 0", lambda: isolability(found, draws=0)),
+        (StructureError, "calibration must be a positive", lambda: isolability(found, calibration=0.5)),
+        (StructureError, "fit in memory", lambda: isolability(found, 10**8)),
         (StructureError, "No candidate has a signature",
-         lambda: dictionary(small(), kinds="loss", state_jump=False).isolability(40)),
+         lambda: isolability(dictionary(small(), kinds="loss", state_jump=False), 40)),
         (LookupFailed, "sensor:y2",
-         lambda: found.isolability(20, calibration=5000, draws=50).forecast("sensor:y", 1.0)),
+         lambda: isolability(found, 20, calibration=5000, draws=50).forecast("sensor:y", 1.0)),
     )
 
 
@@ -176,7 +175,7 @@ def test_bad_input(found):
 @pytest.mark.slow
 def test_the_forecast_of_a_loss_meets_records_with_that_input():
     u, lossy = levels(160, 5), dictionary(small(), kinds=["bias", "loss"])
-    study = lossy.isolability(60, u=u[100:], draws=2000)
+    study = isolability(lossy, 60, u=u[100:], draws=2000)
     share = 0.8 * study.isolable[study.labels.index("actuator:u1 loss")]
     assert 0 < share < 1 and study.skipped == ("sensor:y1 loss", "sensor:y2 loss")
     assert abs(compared(study, lossy, "actuator:u1 loss", share, 60, u=u, make=Fault.loss)[0]) < 0.075
@@ -185,12 +184,12 @@ def test_the_forecast_of_a_loss_meets_records_with_that_input():
 def test_an_actuator_that_does_not_move_is_untestable_and_more_than_all_cannot_be_lost():
     lossy, u = dictionary(small(), kinds="loss", actuators=["u1"]), levels(40, 3)
     with pytest.raises(DataError, match="actuator:u1 loss: untestable"):
-        lossy.isolability(40, u=u * [0.0, 1.0], calibration=5000)
-    weak = lossy.isolability(40, u=0.01 * u, calibration=5000, draws=200)
+        isolability(lossy, 40, u=u * [0.0, 1.0], calibration=5000)
+    weak = isolability(lossy, 40, u=0.01 * u, calibration=5000, draws=200)
     assert np.isinf(weak.detectable[0]) and "never" in str(weak)
     weak.plot()
     with pytest.raises(DataError, match="u has 30 samples; the window has 40"):
-        lossy.isolability(40, u=u[:30])
+        isolability(lossy, 40, u=u[:30])
 
 
 def run(*words):
@@ -198,8 +197,8 @@ def run(*words):
 
 
 def test_the_page_has_a_row_for_every_fault_and_the_printed_matrix(tmp_path):
-    found = dictionary(small()).isolability(40, calibration=5000, draws=100)
-    page = write(found, tmp_path / "page.html", command="optid isolability model.json").read_text(encoding="utf-8")
+    found = isolability(dictionary(small()), 40, calibration=5000, draws=100)
+    page = found.report(tmp_path / "page.html", command="optid isolability model.json").read_text(encoding="utf-8")
     assert all(f"<td>{label}" in page or f"{label}</th>" in page for label in found.labels)
     assert page.count("optid isolability model.json") == 1 and str(found).splitlines()[0] in page
     assert "http://" not in page.replace("http://www.w3.org", "") and "Isolability matrix" in page

@@ -67,7 +67,7 @@ def test_principal_components_agree_with_the_published_rates(plant):
 @pytest.mark.parametrize("name", process.COOLING)
 def test_tennessee_misses_no_more_than_principal_components_and_names_the_valve(plant, name):
     detector, stored, pca = plant
-    assert detector.limits.share <= process.FALSE_ALARM
+    assert detector.share <= process.FALSE_ALARM
     result = process.judged(detector.along(stored[f"{name}_te"]), detector)
     assert result.missed <= np.mean(pca[f"{name}_te"][process.ONSET :] <= 1, axis=0).min()
     assert result.early < 0.03

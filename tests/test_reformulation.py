@@ -16,12 +16,12 @@ from optid.bases import Polynomial, Triangular
 from optid.core.program import as_program
 from optid.errors import DataError, DataWarning, LookupFailed, RankError, StructureError
 from optid.faults import (
-    Answer,
     Certificate,
     Diagnosis,
     Estimate,
     Fault,
-    Prior,
+    FaultAnswer,
+    RefitPrior,
     allocate,
     conditional_mean,
     dictionary,
@@ -81,7 +81,7 @@ def diagnosis(model, *answers, verdict="faulty"):
 
 
 def answer(*estimates, posterior=1.0):
-    return Answer(estimates, posterior, 10.0)
+    return FaultAnswer(estimates, posterior, 10.0)
 
 
 def clean_outputs(model, count, seed):
@@ -195,7 +195,7 @@ def test_evidence_is_the_density_of_the_record(healthy):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.4), count=ONSET + 12)
     found = []
     for curvature in (0.02, 0.1, 0.5):
-        problem = refitting(healthy, data, damaged(1), prior=Prior(curvature=curvature))
+        problem = refitting(healthy, data, damaged(1), prior=RefitPrior(curvature=curvature))
         r, s = problem.linearised(problem.start)
         rows, wanted = problem.believed()
         rows, wanted = np.vstack([rows, 2 * np.eye(8)[7:]]), np.append(wanted, 1.0)
@@ -261,7 +261,7 @@ def test_all_parameters_overtake_when_the_healthy_model_is_off(healthy, faults):
 
 def test_gauss_newton_ends_at_a_stationary_point(healthy):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), count=300)
-    problem = refitting(healthy, data, damaged(1), whole=True, prior=Prior(healthy=0.05))
+    problem = refitting(healthy, data, damaged(1), whole=True, prior=RefitPrior(healthy=0.05))
     found = run(parameters(problem, constraints=[]), prove=False)
     r, s = problem.linearised(found.model.theta)
     rows, wanted = problem.believed()
@@ -346,7 +346,8 @@ def test_what_does_not_fit_is_refused_by_name(healthy, faults):
         *((StructureError, next(iter(wrong)), lambda w=wrong: reformulate(healthy, good, data, **w)) for wrong in (
             {"stage": "everything"}, {"nodes": 2}, {"if_ambiguous": "maybe"}, {"low": [-1.0, -1.0, -1.0]})),
         (DataError, f"Sample {ONSET + 10} lacks an input", lambda: reformulate(healthy, good, Data(u, data.y))),
-        (StructureError, "positive", lambda: Prior(damaged=0)), (LookupFailed, "y9", lambda: observer(healthy, ["y9"])),
+        (StructureError, "positive", lambda: RefitPrior(damaged=0)),
+        (LookupFailed, "y9", lambda: observer(healthy, ["y9"])),
         *((StructureError, words, lambda how=how: allocate(healthy, **how)) for how, words in (
             ({"low": 1.0, "high": 0.0}, "empty"), ({"weights": [1.0, -1.0]}, "positive"),
             ({"route": "magic"}, "route"), ({"norm": np.eye(3), "limit": 1.0}, "norm of shape"))),
@@ -567,15 +568,13 @@ def test_a_probe_separates_more_than_chance_and_less_than_its_bound(healthy, fau
 
 
 def test_printing_drawing_and_the_page(healthy, faults, tmp_path):
-    from optid.faults.repair.page import write
-
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5))
     both = answer(estimate(faults, "actuator:u2 loss", 0.5), estimate(faults, "sensor:y1", 0.3))
     found = reformulate(healthy, diagnosis(healthy, both), data)
     assert max(map(len, str(found).splitlines())) <= 80
     assert set(found.error_bound) == {"y1", "y2"} and "rms error of the simulation at most: y1 " in str(found)
-    assert len(found.plot().axes) == 4
-    page = write(found, tmp_path / "r.html", record="faulty").read_text()
+    assert len(found.plot().axes) == 3
+    page = found.report(tmp_path / "r.html", record="faulty").read_text()
     assert "actuator:u2 loss" in page and "http" not in page.replace("http://www.w3.org", "")
 
 

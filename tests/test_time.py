@@ -270,9 +270,7 @@ def test_an_onset_is_printed_with_its_date(plant, tmp_path):
     assert found.to_dict()["candidates"][0]["faults"][0]["onset_time"] == date
     assert str(load_diagnosis(found.save(tmp_path / "d.json"))) == str(found)
     assert str(found).startswith(f"The record\n- {FINDING}\nfaulty")
-    from optid.faults.diagnosis.page import write
-
-    page = write(found, tmp_path / "d.html").read_text(encoding="utf-8")
+    page = found.report(tmp_path / "d.html").read_text(encoding="utf-8")
     assert page.index('<section id="record"') < page.index('<section id="verdict"') and date in page
 
 

@@ -19,7 +19,7 @@ from plants import BEFORE, PLANT, REACH, Window, cut, deflected, levels, rate, s
 
 from optid import Data
 from optid.faults import Dictionary, Fault, dictionary, health, inject, scan, thresholds, whiten
-from optid.faults.faults import place_of
+from optid.faults.places import place_of
 from optid.models import HammersteinSS
 
 WINDOW = 200

@@ -28,7 +28,7 @@ from optid.bases import Triangular, UserFunctions
 from optid.errors import OptidError
 from optid.faults import trajectory
 from optid.faults.repair.damage import Damage
-from optid.faults.repair.refitting import Prior, Refitting, refitting
+from optid.faults.repair.refitting import RefitPrior, Refitting, refitting
 from optid.faults.repair.schedule import refit
 from optid.models import HammersteinSS, Nonlinearity
 from optid.solving.solve import run
@@ -118,7 +118,7 @@ def one(plant: HammersteinSS, damaged: HammersteinSS, count: int, seed: int, off
         return Damage(f"u{which + 1}", 1.0, BEFORE, True, (which,), (), (), (), {}, np.zeros((4, 4)), np.ones(2),
                       np.zeros(2), np.zeros(4), ())
 
-    def narrow(which: int = 1, prior: Prior | None = None, rules: Any = "default") -> Any:
+    def narrow(which: int = 1, prior: RefitPrior | None = None, rules: Any = "default") -> Any:
         problem = refitting(known, data, broken(which), prior=prior)
         return run(actuator(problem, constraints=rules), prove=False).model.model
 
@@ -132,7 +132,7 @@ def one(plant: HammersteinSS, damaged: HammersteinSS, count: int, seed: int, off
 
     tries: dict[str, Callable[[], Any]] = {
         "what broke, QP": narrow,
-        "what broke, LS": lambda: narrow(prior=Prior(curvature=1e3), rules=[]),
+        "what broke, LS": lambda: narrow(prior=RefitPrior(curvature=1e3), rules=[]),
         "all, prior": wide,
         "all, no prior": no_prior,
         "wrong actuator": lambda: narrow(0),

@@ -29,15 +29,14 @@ import optid
 from optid.errors import DataWarning
 from optid.faults import (
     Dictionary,
-    EmpiricalThresholds,
-    SlidingScan,
     dictionary,
-    empirical_thresholds,
     health,
     predictor,
-    sliding_scan,
+    thresholds,
     whiten,
 )
+from optid.faults.search.sweeps import sweep
+from optid.faults.whitening import Whitened
 from optid.identify.noise import with_noise
 
 OUTPUTS = [f"XMEAS{i}" for i in range(1, 23)]
@@ -85,15 +84,34 @@ def held_out(healthy: np.ndarray) -> dict[int, float]:
     return found
 
 
+def statistics(found: Dictionary, white: Whitened, window: int) -> np.ndarray:
+    """Return the largest energy (M, C) that every candidate explains of every window of a record."""
+    views = np.lib.stride_tricks.sliding_window_view(white.r, window, axis=0).swapaxes(1, 2)
+    return sweep(found, window).largest(views)
+
+
 class Detector(NamedTuple):
-    """A search along records with thresholds from d00_te."""
+    """A search along records with thresholds from d00_te: those of white noise times one factor."""
 
     found: Dictionary
-    limits: EmpiricalThresholds
+    window: int
+    q: np.ndarray
+    factor: float
+    share: float  # of the healthy windows that exceed them
 
-    def along(self, table: np.ndarray) -> SlidingScan:
+    def along(self, table: np.ndarray) -> "Course":
         """Search every window of a record."""
-        return sliding_scan(self.found, whiten(self.found.model, record(table)), self.limits.window)
+        found = statistics(self.found, whiten(self.found.model, record(table)), self.window)
+        stops = self.window + np.arange(len(found))
+        return Course(stops, np.max(found / self.q, axis=1) > 1, np.argmax(found - self.q, axis=1))
+
+
+class Course(NamedTuple):
+    """The windows of a record: the sample after the last of each, whether it alarms, and the candidate accused."""
+
+    stops: np.ndarray
+    alarms: np.ndarray
+    accused: np.ndarray
 
 
 def detector(stored: dict[str, np.ndarray], nx: int, window: int | None = None) -> Detector:
@@ -102,9 +120,12 @@ def detector(stored: dict[str, np.ndarray], nx: int, window: int | None = None) 
         warnings.simplefilter("ignore", DataWarning)  # groups that look the same; thresholds from few excursions
         model = fitted(record(stored["d00"]), nx)
         found = dictionary(model, kinds=["bias"])
-        white = whiten(model, record(stored["d00_te"]))
-        return Detector(found, empirical_thresholds(found, white, window or 2 * nx + 2, FALSE_ALARM,
-                                                    extrapolate=window is not None))
+        window = 2 * nx + 2 if window is None else window
+        ratios = statistics(found, whiten(model, record(stored["d00_te"])), window)
+        q = thresholds(found, window, FALSE_ALARM).q
+        largest = np.max(ratios / q, axis=1)
+        factor = float(np.quantile(largest, 1 - FALSE_ALARM, method="higher"))
+        return Detector(found, window, factor * q, factor, float(np.mean(largest > factor)))
 
 
 class Result(NamedTuple):
@@ -116,14 +137,14 @@ class Result(NamedTuple):
     accused: list[tuple[str, float]]
 
 
-def judged(course: SlidingScan, found: Detector) -> Result:
+def judged(course: Course, found: Detector) -> Result:
     """Judge the windows that end after the onset, and those before."""
-    alarms, late = course.alarms(found.limits), course.stops > ONSET
-    names = [found.found.labels[i] for i in course.accused(found.limits)[alarms & late]]
+    alarms, late = course.alarms, course.stops > ONSET
+    names = [found.found.labels[i] for i in course.accused[alarms & late]]
     hits = np.flatnonzero(alarms[late])
     share = [(name, count / max(len(names), 1)) for name, count in Counter(names).most_common(2)]
     # windows begin after `window` samples; the samples after the onset are all covered
-    return Result(1 - float(np.sum(alarms[late])) / (course.samples - ONSET), float(np.mean(alarms[~late])),
+    return Result(1 - float(np.sum(alarms[late])) / (course.stops[-1] - ONSET), float(np.mean(alarms[~late])),
                   float(hits[0]) if hits.size else np.inf, share)
 
 
@@ -158,13 +179,12 @@ def main() -> None:
     pca = components(stored)
     for window in [None, *arguments.windows]:
         found = detector(stored, nx, window)
-        limits = found.limits
         if window is None:
             print(f"{len(found.found.candidates)} candidates: offsets of {len(INPUTS)} valves and {len(OUTPUTS)} "
                   "sensors, a jump of the state")
             print(health(whiten(found.found.model, record(stored["d00_te"]))))
-        print(f"\nwindow {limits.window} samples; thresholds {limits.factor:.2f} times those of white innovations; "
-              f"{limits.share:.2%} of d00_te alarm, in {limits.excursions} excursions")
+        print(f"\nwindow {found.window} samples; thresholds {found.factor:.2f} times those of white innovations; "
+              f"{found.share:.2%} of d00_te alarm")
         print(f"{'record':<7}{'missed':>8}{'T2':>8}{'Q':>8}  {'goal':<16}{'delay':>6}{'early':>7}{'T2':>7}{'Q':>7}"
               "  accused")
         for name, what in FAULTS.items():

@@ -32,6 +32,7 @@ def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: fl
         raise StructureError(f"--onset {onset}: must be the number of a sample, or unknown")
     with working(report, picture) as work:
         from optid.faults import dictionary
+        from optid.faults import isolability as simulate
 
         plant = words.state_space_model(model)
         work.step("signatures")
@@ -39,13 +40,11 @@ def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: fl
                            process=words.directions(load, "--process", plant), state_jump=state_jump,
                            disturbances=words.listed(disturbance) or ())
         work.step("simulating faults")
-        study = found.isolability(window, onset=onset if onset == "unknown" else int(onset), prob=prob,
-                                  false_alarm=false_alarm, draws=draws, seed=seed)
+        study = simulate(found, window, onset=onset if onset == "unknown" else int(onset), prob=prob,
+                         false_alarm=false_alarm, draws=draws, seed=seed)
         work.text = str(study)
         if report is not None:
-            from optid.faults.isolability_page import write
-
-            work.write("report", report, lambda path: write(study, path, command=command_line()))
+            work.write("report", report, lambda path: study.report(path, command=command_line()))
         work.draw(study.plot, picture)
 
 
@@ -117,10 +116,8 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
                 "from which the model was identified) accounts for its uncertainty."
             )
         if report is not None:
-            from optid.faults.diagnosis.page import write
-
-            work.write("report", report, lambda path: write(
-                answer, path, record=record.name, command=command_line()))
+            work.write("report", report, lambda path: answer.report(
+                path, record=record.name, command=command_line()))
         work.draw(answer.plot, picture)
 
 
@@ -185,8 +182,6 @@ def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: st
         if target is not None:
             work.text += f"\ntarget {built.attainable(words.numbers(target, '--target') or [])}"
         if report is not None:
-            from optid.faults.repair.page import write
-
-            work.write("report", report, lambda path: write(
-                built, path, record=record.name or (data[0].name if data else ""), command=command_line()))
+            work.write("report", report, lambda path: built.report(
+                path, record=record.name or (data[0].name if data else ""), command=command_line()))
         work.draw(built.plot, picture)

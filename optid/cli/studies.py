@@ -188,7 +188,7 @@ def _now(row: dict[str, Any] | None) -> str:
         return "cells"
     from rich.markup import escape
 
-    from optid.show.wording import short
+    from optid.phrases import short
 
     formulation, solver = (escape(short(row[name], 28)) for name in ("formulation", "solver"))
     return f"[dim]{formulation} · {solver}: {row['status_verified'] or row['outcome']}[/]"

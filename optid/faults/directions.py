@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import LookupFailed, StructureError, nearest
-from optid.faults.faults import place_of
+from optid.faults.places import place_of
 from optid.faults.whitening import Predictor, predictor
 
 if TYPE_CHECKING:

@@ -5,33 +5,15 @@ the state equation changes x(theta) first, so it is present in the step from the
 equation, a direct feedthrough included, changes y(theta) first.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
-from optid.errors import DataError, LookupFailed, StructureError, nearest
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
-
-ADDITIVE = ("step", "jump", "ramp")
-PLACES = {
-    "step": ("actuator", "sensor", "process", "state"),
-    "jump": ("actuator", "sensor", "process", "state"),
-    "ramp": ("actuator", "sensor", "process", "state"),
-    "loss": ("actuator", "sensor"),
-    "stuck": ("actuator", "sensor"),
-    "frozen": ("actuator", "sensor"),
-    "hard_over": ("actuator", "sensor"),
-    "process_noise": ("process", "state"),
-    "sensor_noise": ("sensor",),
-    "schedule": ("process", "state"),
-}
-"""The places where each kind of fault can be."""
+from optid.errors import DataError, LookupFailed, StructureError
+from optid.faults.kinds import FaultKind, kind_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +22,7 @@ class Fault:
 
     Attributes:
         name: place: "actuator:u1", "sensor:y2", "process:load" (a direction in the state equation), "state".
-        kind: one of the keys of `PLACES`.
+        kind: the word of its kind (`optid.faults.kinds`).
         onset: first sample of the record that it can change.
         end: first sample that it no longer changes; None for a lasting fault.
         size: size of an additive fault, share lost of a loss, value of a stuck one; None where the kind has none.
@@ -70,19 +52,26 @@ class Fault:
     B: Any = None
 
     def __post_init__(self) -> None:
-        if self.kind not in PLACES:
-            raise StructureError(f"fault of kind {self.kind!r}: {nearest(self.kind, PLACES)}")
-        place = self.place
-        if place not in PLACES[self.kind]:
+        try:
+            kind_of(self.kind)
+        except LookupFailed as error:
+            raise StructureError(f"{self.name}: {error}") from None
+        possible = (*self.fault_kind.places, *self.fault_kind.simulated)
+        if self.place not in possible:
             raise StructureError(
                 f"{self.name!r} cannot have a fault of kind {self.kind!r}: "
-                f"its name begins with {' or '.join(repr(p) for p in PLACES[self.kind])}, as in 'actuator:u1'."
+                f"its name begins with {' or '.join(map(repr, possible))}, as in 'actuator:u1'."
             )
         for word, value in (("onset", self.onset), ("end", self.end)):
             if value is not None and (value != int(value) or value < 0):
                 raise StructureError(f"{self.name}: {word} = {value!r}; it must be a nonnegative integer.")
         if self.end is not None and self.end <= self.onset:
             raise StructureError(f"{self.name}: end = {self.end} is not after onset = {self.onset}.")
+
+    @property
+    def fault_kind(self) -> FaultKind:
+        """The record of its kind."""
+        return kind_of(self.kind)
 
     @property
     def place(self) -> str:
@@ -125,19 +114,20 @@ class Fault:
             end: first sample that it no longer changes.
             direction: (n,) of a "process" fault.
         """
-        return cls(name, "step", onset, end, _finite(name, size, "size"), _finite(name, direction, "direction"))
+        return cls(name, "bias", onset, end, _finite(name, size, "size"), _finite(name, direction, "direction"))
 
     @classmethod
     def jump(cls, name: str, onset: int, size: ArrayLike, *, direction: ArrayLike | None = None) -> "Fault":
         """Return an offset in one sample only: a jump of the state, a spike of a sensor. Arguments as `step`."""
-        return cls(name, "jump", onset, None, _finite(name, size, "size"), _finite(name, direction, "direction"))
+        kind = "spike" if name.startswith("sensor") else "jump"
+        return cls(name, kind, onset, None, _finite(name, size, "size"), _finite(name, direction, "direction"))
 
     @classmethod
     def ramp(
         cls, name: str, onset: int, slope: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
     ) -> "Fault":
         """Return a drift: slope at the onset, twice the slope one sample later, .... Arguments as `step`."""
-        return cls(name, "ramp", onset, end, _finite(name, slope, "size"), _finite(name, direction, "direction"))
+        return cls(name, "drift", onset, end, _finite(name, slope, "size"), _finite(name, direction, "direction"))
 
     drift = ramp
 
@@ -190,7 +180,7 @@ class Fault:
         the standard deviation along the direction (of every state), scale, the factor of the standard deviation of the
         present noise, and covariance (n, n); onset, end and direction as `step`.
         """
-        return cls(name, "process_noise", onset, end, None, _finite(name, direction, "direction"), 0.0,
+        return cls(name, "noise", onset, end, None, _finite(name, direction, "direction"), 0.0,
                    *_noise(name, std, scale, covariance))
 
     @classmethod
@@ -199,7 +189,7 @@ class Fault:
         covariance: ArrayLike | None = None, end: int | None = None,
     ) -> "Fault":
         """Return additional white noise of a sensor, (1.13); "sensor" alone is all of them. As `process_noise`."""
-        return cls(name, "sensor_noise", onset, end, None, None, 0.0, *_noise(name, std, scale, covariance))
+        return cls(name, "noise", onset, end, None, None, 0.0, *_noise(name, std, scale, covariance))
 
     @classmethod
     def schedule(cls, onset: int = 0, *, A: Any = None, B: Any = None, end: int | None = None) -> "Fault":
@@ -217,100 +207,6 @@ class Fault:
         if A is None and B is None:
             raise StructureError("schedule: give A, B or both.")
         return cls("process", "schedule", onset, end, A=A, B=B)
-
-
-def place_of(model: "HammersteinSS", name: str, direction: Any = None,
-             process: Mapping[str, ArrayLike] | None = None) -> tuple[Array, Array]:
-    """Return where an additive fault enters: the state equation (n, d) and the output equation (l, d).
-
-    Args:
-        model: the model.
-        name: "actuator:u1", "sensor:y1", "process:load", "process:x1", "process" or "state".
-        direction: (n,) or (n, d) of a "process" fault.
-        process: directions by name, where `direction` is not given.
-
-    Raises:
-        LookupFailed: no such channel or direction.
-        StructureError: a direction of another shape.
-    """
-    place, _, channel = name.partition(":")
-    n, l = model.nx, model.l  # noqa: E741
-    if place == "actuator":
-        columns = functions_of(model, name)
-        return np.array(model.B[:, columns]), np.array(model.D[:, columns])
-    if place == "sensor":
-        reading = range(l) if not channel else [channel_of(model.outputs, name)]
-        return np.zeros((n, len(reading))), np.eye(l)[:, list(reading)]
-    if place == "process" and direction is None and channel:
-        states = [f"x{i}" for i in range(1, n + 1)]
-        if process is not None and channel in process:
-            direction = process[channel]
-        elif channel in states:
-            direction = np.eye(n)[:, states.index(channel)]
-        else:
-            raise LookupFailed(
-                f"{name!r}: no direction of this name. Give direction=(n,) with the fault, or "
-                f"process={{{channel!r}: (n,)}}; 'process:x1' is the first state. {nearest(channel, process or states)}"
-            )
-    if place == "process" and direction is not None:
-        columns = np.asarray(direction, dtype=float)
-        columns = columns[:, None] if columns.ndim == 1 else columns
-        if columns.ndim != 2 or len(columns) != n or not columns.any() or not np.isfinite(columns).all():
-            raise StructureError(
-                f"{name}: direction of shape {np.shape(direction)}; it must be ({n},), finite and not zero."
-            )
-        return columns, np.zeros((l, columns.shape[1]))
-    if place in ("process", "state") and not channel:
-        return np.eye(n), np.zeros((l, n))
-    raise LookupFailed(
-        f"{name!r}: a fault is named 'actuator:<input>', 'sensor:<output>', 'process:<direction>' or 'state'."
-    )
-
-
-def channel_of(names: tuple[str, ...], name: str) -> int:
-    """Return the index of the channel that the name of a fault ends in.
-
-    Raises:
-        LookupFailed: no such channel.
-    """
-    channel = name.partition(":")[2]
-    if channel not in names:
-        raise LookupFailed(f"{name!r}: there is no channel {channel!r}. {nearest(channel, names)}")
-    return names.index(channel)
-
-
-def functions_of(model: "HammersteinSS", name: str) -> list[int]:
-    """Return the functions of the input that the name of a fault ends in; errors as `channel_of`."""
-    c = channel_of(model.inputs, name)
-    return [i for i, of in enumerate(model.input_of) if of == c]
-
-
-def matrices_of(label: str, word: str, given: Any, samples: range, healthy: Array, count: int) -> Array:
-    """Return the matrices A(k) or B(k) of a schedule at some samples, (samples, ...).
-
-    Args:
-        label: of the fault, for messages.
-        word: "A" or "B".
-        given: one matrix, one for each of `count` samples, or a function of k; None for the healthy one.
-        samples: those returned.
-        healthy: the matrix of the model.
-        count: samples of the record.
-
-    Raises:
-        StructureError: matrices of another shape, or not finite.
-    """
-    values = healthy if given is None else given
-    values = np.array([values(k) for k in samples]) if callable(values) else np.asarray(values, dtype=float)
-    if not callable(given) and values.shape == (count, *healthy.shape):
-        values = values[samples.start : samples.stop]
-    if values.shape not in (healthy.shape, (len(samples), *healthy.shape)):
-        raise StructureError(
-            f"{label}: {word} has shape {values.shape}; it must be {healthy.shape}, or {(count, *healthy.shape)} "
-            "with one matrix for each sample."
-        )
-    if not np.isfinite(values).all():
-        raise StructureError(f"{label}: {word} has a value that is not finite.")
-    return np.broadcast_to(values, (len(samples), *healthy.shape))
 
 
 def _finite(name: str, value: Any, word: str) -> Any:

@@ -8,7 +8,8 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array, compact, one_or_all
 from optid.errors import DataError, StructureError
-from optid.faults.faults import ADDITIVE, Fault, channel_of, functions_of, matrices_of, place_of
+from optid.faults.faults import Fault
+from optid.faults.faulty_plant import FaultyPlant
 from optid.models.experiments import check_inputs, records_of, state_like
 from optid.models.kalman import NoiseCovariances
 
@@ -26,35 +27,6 @@ class Trajectory(NamedTuple):
 
     y: Array
     x: Array
-
-
-class Sensors(NamedTuple):
-    """The sensors of a record: a reading is gain * output + shift + noise, unless it is fixed or held."""
-
-    gain: Array  # (N, l)
-    shift: Array  # (N, l)
-    noise: Array  # (N, l)
-    fixed: Array  # (N, l) reading that replaces the output; NaN for none
-    hold: Array  # (N, l) whether the reading of the sample before is repeated
-
-    @classmethod
-    def healthy(cls, noise: Array) -> "Sensors":
-        """Return sensors without a fault."""
-        return cls(np.ones(noise.shape), np.zeros(noise.shape), noise, np.full(noise.shape, np.nan),
-                   np.zeros(noise.shape, dtype=bool))
-
-
-class _Plan(NamedTuple):
-    """Signals of a record with faults."""
-
-    state: Array  # (N, r) functions of the inputs in the next state
-    output: Array  # (N, r) those in the output
-    jolt: Array  # (N, n) added to the next state
-    start: Array  # (n,) added to the first one
-    w: Array  # (N, n) process noise
-    sensors: Sensors
-    A: Array  # (N, n, n)
-    B: Array  # (N, n, r)
 
 
 def inject(
@@ -110,7 +82,7 @@ def trajectory(
     inputs = records_of(model, [np.asarray(u)])[0][0][0]
     check_inputs(model, inputs, "")
     broken = [faults] if isinstance(faults, Fault) else list(faults)
-    plan = _planned(model, inputs, broken, _covariances(model, noise), seed, process or {})
+    plan = _broken(model, inputs, broken, _covariances(model, noise), seed, process or {})
     drive = plan.jolt + model.offset_x + np.einsum("kir,kr->ki", plan.B, plan.state, optimize=True)
     direct = plan.output @ model.D.T + model.offset_y
     x = _started(model, x0, inputs) + plan.start
@@ -125,92 +97,16 @@ def trajectory(
     return Trajectory(readings, states)
 
 
-def _planned(
+def _broken(
     model: "HammersteinSS", u: Array, faults: list[Fault], covariances: NoiseCovariances | None, seed: Any,
     process: Mapping[str, ArrayLike],
-) -> _Plan:
-    count, n, l = len(u), model.nx, model.l  # noqa: E741
+) -> FaultyPlant:
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     healthy, *streams = (np.random.default_rng(s) for s in root.spawn(len(faults) + 1))
-    f, drawn = model.expanded(u), np.zeros((count, n + l))
-    if covariances is not None:
-        drawn = _draw(healthy, count, np.block([[covariances.Q, covariances.S], [covariances.S.T, covariances.R]]))
-    w, v = np.ascontiguousarray(drawn[:, :n]), np.ascontiguousarray(drawn[:, n:])
-    plan = _Plan(
-        f, f.copy(), np.zeros((count, n)), np.zeros(n), w, Sensors.healthy(v),
-        np.broadcast_to(model.A, (count, n, n)), np.broadcast_to(model.B, (count, n, f.shape[1])),
-    )
-    for fault, stream in sorted(zip(faults, streams), key=lambda pair: pair[0].kind in ADDITIVE):
-        now = fault.active(count)
-        before = slice(max(now.start - 1, 0), now.stop - 1)
-        if fault.kind in ADDITIVE:
-            _add(model, plan, fault, now, before, process)
-        elif fault.kind == "schedule":
-            for word, given in (("A", fault.A), ("B", fault.B)):
-                if given is not None:
-                    changed = np.array(getattr(plan, word))
-                    changed[before] = matrices_of(
-                        "schedule", word, given, range(before.start, before.stop), getattr(model, word), count)
-                    plan = plan._replace(**{word: changed})
-        elif fault.kind in ("process_noise", "sensor_noise"):
-            state, output = place_of(model, fault.name, fault.direction, process)
-            where, target, samples, word = (output, plan.sensors.noise, now, "R") if fault.kind == "sensor_noise" else (
-                state, plan.w, before, "Q")
-            spread = _added(fault, where, None if covariances is None else getattr(covariances, word))
-            target[samples] += _draw(stream, samples.stop - samples.start, spread) @ where.T
-        elif fault.place == "actuator":
-            _break_actuator(model, plan, fault, now, before, u)
-        else:
-            _break_sensor(model, plan.sensors, fault, now)
-    return plan
-
-
-def _add(
-    model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice, before: slice, process: Mapping[str, ArrayLike]
-) -> None:
-    into_state, into_output = place_of(model, fault.name, fault.direction, process)
-    size = np.asarray(fault.size)
-    if size.shape != (into_state.shape[1],):
-        raise StructureError(
-            f"{fault.name}: size of shape {size.shape}; this place has {into_state.shape[1]} columns: give one entry "
-            "for each."
-        )
-    course = np.zeros(len(plan.jolt))
-    course[now] = np.arange(1, now.stop - now.start + 1) if fault.kind == "ramp" else 1.0
-    if fault.kind == "jump":
-        course[now.start + 1 :] = 0.0
-    if fault.place == "actuator":  # through B(k), which may be scheduled
-        columns = functions_of(model, fault.name)
-        plan.output[:, columns] += np.outer(course, size)
-        plan.state[:-1, columns] += np.outer(course[1:], size)
-    else:
-        plan.sensors.shift[:] += np.outer(course, into_output @ size)
-        plan.jolt[:-1] += np.outer(course[1:], into_state @ size)
-    plan.start[:] += course[0] * (into_state @ size)
-
-
-def _break_actuator(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice, before: slice, u: Array) -> None:
-    c, size = channel_of(model.inputs, fault.name), fault.size
-    stop = u[max(now.start - 2, 0), c] if size == "last" else size
-    for values, samples in ((plan.output, now), (plan.state, before)):
-        for i in functions_of(model, fault.name):
-            if fault.kind == "loss":
-                values[samples, i] = (1.0 - np.asarray(size)) * values[samples, i] + fault.bias
-            else:
-                values[samples, i] = 0.0 if size is None else model.nonlinearities[i](stop)
-
-
-def _break_sensor(model: "HammersteinSS", sensors: Sensors, fault: Fault, now: slice) -> None:
-    o = channel_of(model.outputs, fault.name)
-    if fault.kind == "loss":
-        sensors.gain[now, o] *= 1.0 - np.asarray(fault.size)
-        sensors.shift[now, o] += fault.bias
-    elif fault.size is None:
-        sensors.gain[now, o] = 0.0
-    elif fault.size == "last":
-        sensors.hold[now, o] = True
-    else:
-        sensors.fixed[now, o] = fault.size
+    plant = FaultyPlant(model, u, covariances, process, healthy)
+    for fault, stream in sorted(zip(faults, streams), key=lambda pair: pair[0].fault_kind.additive):
+        fault.fault_kind.simulate(fault, plant.at(fault.active(len(u)), stream))
+    return plant
 
 
 def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> NoiseCovariances | None:
@@ -228,32 +124,6 @@ def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> Noise
             "noise='none' for a run without noise."
         )
     return model.noise
-
-
-def _draw(rng: np.random.Generator, count: int, covariance: Array) -> Array:
-    """Draw (count, d) Gaussian samples of a covariance that may be singular."""
-    sizes, axes = np.linalg.eigh(covariance)
-    if sizes[0] < -1e-8 * max(sizes[-1], 0.0):
-        raise StructureError("The covariance of the noise is not positive semidefinite.")
-    return rng.standard_normal((count, len(covariance))) @ (axes * np.sqrt(np.maximum(sizes, 0.0))).T
-
-
-def _added(fault: Fault, where: Array, present: Array | None) -> Array:
-    """Return the covariance (d, d) of the added noise along the columns of `where`."""
-    d = where.shape[1]
-    if fault.covariance is not None:
-        if fault.covariance.shape != (d, d):
-            raise StructureError(
-                f"{fault.name}: covariance of shape {fault.covariance.shape}; it must be ({d}, {d})."
-            )
-        return fault.covariance
-    if fault.std is not None:
-        return fault.std**2 * np.eye(d)
-    assert fault.scale is not None
-    if present is None:
-        raise StructureError(f"{fault.name}: scale multiplies the noise of the model, which has none: give std.")
-    along = np.linalg.pinv(where)
-    return (fault.scale**2 - 1) * along @ present @ along.T
 
 
 def _started(model: "HammersteinSS", x0: Any, u: Array) -> Array:

@@ -15,7 +15,7 @@ def march_faulty(parts, A, drive, direct, sensors, true_feedback, start):
         A: (1, n, n), or (N, n, n) of every step from k to k + 1.
         drive: (N, n) inputs, constants, faults and process noise in the step from k to k + 1.
         direct: (N, l) inputs and constants in the output.
-        sensors: `optid.faults.injection.Sensors`.
+        sensors: `optid.faults.faulty_plant.Sensors`.
         true_feedback: whether the plant feeds back its true outputs, not those of the faulty sensors.
         start: (n,) state of the first sample.
 

@@ -43,7 +43,7 @@ from optid.data.stretches import interpolated
 from optid.errors import DataError
 from optid.faults.ranges import outside, unknown_effects
 from optid.faults.screening import check_causality
-from optid.faults.whitening import Predictor, predictor, whiten
+from optid.faults.whitening import Nuisance, Predictor, predictor, whiten
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
 
@@ -84,32 +84,6 @@ DRAWS = 4000
 
 DIFFUSE = 1e6
 """Standard deviation of an unknown initial state, relative to its effect."""
-
-
-@dataclass(frozen=True, eq=False)
-class Nuisance:
-    """(I + M M')^(-1/2) = I - U diag(1 - 1/sqrt(1 + s^2)) U' with the singular values s of M.
-
-    Attributes:
-        U: (N l, q) orthonormal.
-        s: (q,).
-        unknown: number of unknown axes beside the initial state.
-    """
-
-    U: Array
-    s: Array
-    unknown: int = 0
-
-    @property
-    def log_scale(self) -> float:
-        """Logarithm of the determinant of (I + M M')^(1/2)."""
-        return 0.5 * float(np.sum(np.log1p(self.s**2)))
-
-    def __call__(self, r: Array) -> Array:
-        """Whiten (N, l) or (N, l, d)."""
-        flat = r.reshape(len(self.U), -1)
-        drop = 1 - 1 / np.sqrt(1 + self.s**2)
-        return np.asarray((flat - self.U @ (drop[:, None] * (self.U.T @ flat))).reshape(r.shape))
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ BETTER = 0.1
 def flat_lines(data: Data) -> tuple[LostReadings, ...]:
     """Find sensors that repeat one reading more often than their resolution explains: frozen or saturated ones."""
     found = [lost_readings(part.y, data.outputs, number) for number, part in enumerate(data.experiments)]
-    return tuple(line for lines in found for line in lines if line.condition != "dead")
+    return tuple(line for lines in found for line in lines if not line.is_dead)
 
 
 def check_channels(model: "HammersteinSS", data: Data) -> None:

@@ -3,37 +3,26 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.bases import Linear
-from optid.errors import DataError, DataWarning, LookupFailed, StructureError, nearest
+from optid.errors import DataWarning, LookupFailed, StructureError, nearest
 from optid.faults.directions import decoupled
-from optid.faults.faults import Fault, channel_of, place_of
+from optid.faults.faults import Fault
+from optid.faults.kinds import FaultKind, all_kinds, kind_of
+from optid.faults.places import channel_of, place_of
 from optid.faults.ranges import known_range
 from optid.faults.whitening import Predictor, predictor
 
 if TYPE_CHECKING:
-    from optid.faults.isolability import Isolability
     from optid.models import HammersteinSS
 
-ADDITIVE = ("bias", "drift", "jump", "spike")
-"""Kinds whose signature depends on the model and the time since the onset alone."""
-
-KINDS = {
-    "bias": ("actuator", "sensor", "process"),
-    "drift": ("actuator", "sensor", "process"),
-    "jump": ("state",),
-    "spike": ("sensor",),
-    "loss": ("actuator", "sensor"),
-    "stuck": ("actuator",),
-    "frozen": ("sensor",),
-    "noise": ("sensor", "process"),
-}
-"""Possible places of each kind."""
+STANDING, STATE_JUMP = "stuck", "jump"
+"""The kind of an actuator to whose effect any constant is added, and that of the state by default."""
 
 SAME = 1e-3
 """Sine of the angle between two signatures below which no record isolates them."""
@@ -57,7 +46,7 @@ class Candidate:
 
     Attributes:
         name: place, as in `Fault`.
-        kind: one of `KINDS`.
+        kind: the word of its kind (`optid.faults.kinds`).
         into_state: (n, d) where it enters the state equation.
         into_output: (l, d) where it enters the output equation.
         columns: the functions of the input of a loss or a stuck actuator.
@@ -82,9 +71,14 @@ class Candidate:
     zero: float | None = None
 
     @property
+    def fault_kind(self) -> FaultKind:
+        """The record of its kind."""
+        return kind_of(self.kind)
+
+    @property
     def own_label(self) -> str:
         """The name, and the kind unless the name implies it."""
-        return self.name if self.kind in ("bias", "jump") else f"{self.name} {self.kind}"
+        return self.fault_kind.own_label(self.name)
 
     @property
     def label(self) -> str:
@@ -94,14 +88,33 @@ class Candidate:
     @property
     def additive(self) -> bool:
         """Whether the signature depends on the model and the onset alone."""
-        return self.kind in ADDITIVE
+        return self.fault_kind.additive
 
     @property
     def dimension(self) -> int:
         """Number of magnitudes to estimate."""
-        if self.kind in ("loss", "stuck"):
-            return 1 + len(self.columns) * (self.kind == "stuck" or self.constants)
-        return self.into_state.shape[1]
+        return self.fault_kind.dimension(self)
+
+    @property
+    def has_constants(self) -> bool:
+        """Whether constants are added beside a share lost."""
+        return self.constants or self.fault_kind.stands
+
+    @property
+    def is_sensor_gain(self) -> bool:
+        """Whether a share of the reading of a sensor is lost, which changes the filter and has no signature."""
+        return self.fault_kind.driven and not self.columns
+
+    @property
+    def widened(self) -> "Candidate":
+        """The same actuator with any constant added beside the share lost."""
+        return replace(self, kind=STANDING)
+
+    def rest_values(self, model: "HammersteinSS") -> Array:
+        """Return the functions of the inputs (r,) at the input without effect, from which a share lost counts."""
+        if self.zero is None or self.has_constants:
+            return np.zeros(model.B.shape[1])
+        return model.expanded(np.full((1, model.m), self.zero))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,41 +208,7 @@ class Dictionary:
             StructureError: a frozen sensor or a noise, which have no signature; a loss without u.
         """
         c = self[candidate] if isinstance(candidate, str) else candidate
-        since = np.arange(count) - onset
-        if c.additive:
-            course = course_of(c.kind, since)
-            return course[:, None, None] * c.into_state, course[:, None, None] * c.into_output
-        if c.kind == "schedule":
-            raise StructureError(f"{c.label}: its signature depends on the states of a window: see Scan.signature.")
-        if not c.columns:
-            raise StructureError(
-                f"{c.label} has no signature, because its course is not known: test it as an arbitrary waveform or by "
-                "its covariance."
-            )
-        if u is None:
-            raise StructureError(f"{c.label}: its signature depends on the input: pass u (N, m).")
-        inputs = np.asarray(u, dtype=float).reshape(since.size, -1)
-        if inputs.shape[1] != self.model.m:
-            raise DataError(f"u has {inputs.shape[1]} channels; the model has {self.model.m}.")
-        f = self.model.expanded(inputs)[:, list(c.columns)]
-        if c.zero is not None and c.kind == "loss":
-            f = f - self.model.expanded(np.full((1, self.model.m), c.zero))[:, list(c.columns)]
-        on = (since >= 0).astype(float)[:, None]
-        before = np.vstack([np.zeros((1, f.shape[1])), f[:-1]])  # x(k) is driven by the input before
-        begun = on.copy()
-        begun[:1] = 0.0
-        into_state, into_output = [-(on * before) @ c.into_state.T], [-(on * f) @ c.into_output.T]
-        if c.kind == "stuck" or c.constants:
-            for b, d in zip(c.into_state.T, c.into_output.T):
-                into_state.append(begun * b)
-                into_output.append(on * d)
-        return np.stack(into_state, axis=2), np.stack(into_output, axis=2)
-
-    def isolability(self, window: int = 100, **how: Any) -> "Isolability":
-        """Return the smallest detectable and isolable sizes; see `optid.faults.isolability.study`."""
-        from optid.faults.isolability import study
-
-        return study(self, window, **how)
+        return c.fault_kind.additions(c, self.model, np.arange(count) - onset, u)
 
     def __str__(self) -> str:
         """List the candidates, the groups and the excluded faults."""
@@ -240,12 +219,6 @@ class Dictionary:
         lines += [f"  {a} and {b} are close: sine {sine:.3f}" for a, b, sine in self.near]
         lines += [f"  excluded: {label}, {why}" for label, why in self.excluded.items()]
         return "\n".join(lines + ["  unknown: none of these"] * self.unknown)
-
-
-def course_of(kind: str, since: np.ndarray) -> Array:
-    """Return the course (N,) of an additive fault of unit size, by the samples (N,) since its onset."""
-    return np.asarray((since == 0) if kind in ("jump", "spike") else np.maximum(since + 1, 0) if kind == "drift" else
-                      (since >= 0), dtype=float)
 
 
 def dictionary(
@@ -260,7 +233,8 @@ def dictionary(
         model: the healthy model, with noise covariances.
         actuators: "all" or names of inputs.
         sensors: "all" or names of outputs.
-        kinds: of "bias", "loss", "stuck", "frozen", "drift", "noise", "spike"; each at its possible places.
+        kinds: of "bias", "loss", "stuck", "frozen", "drift", "noise", "spike" and those that are installed; each at its
+            possible places.
         process: directions (n,) of disturbances in the state equation, by name.
         state_jump: whether the state may jump, in any direction.
         schedules: known changes of A and B by name.
@@ -279,9 +253,10 @@ def dictionary(
         DataWarning: faults that were merged or excluded; a zero to which a linear function is extrapolated.
     """
     wanted = [kinds] if isinstance(kinds, str) else list(kinds)
-    unknown_kinds = [kind for kind in wanted if kind not in KINDS]
-    if unknown_kinds:
-        raise LookupFailed(f"no fault of kind {unknown_kinds[0]!r}. {nearest(unknown_kinds[0], KINDS)}")
+    possible = {name: kind.places for name, kind in all_kinds().items() if kind.places}
+    for kind in wanted:
+        if kind not in possible:
+            raise LookupFailed(f"no fault of kind {kind!r}. {nearest(str(kind), possible)}")
     declared = [disturbances] if isinstance(disturbances, str) else list(disturbances)
     steady = predictor(model)
     if declared:
@@ -294,10 +269,10 @@ def dictionary(
     at_rest = {_chosen([name], model.inputs)[0]: float(value) for name, value in (zeros or {}).items()}
     for name, value in at_rest.items():
         _check_zero(model, name, value)
-    raw = [candidate_of(model, name, kind, process, at_rest) for kind in wanted if kind != "jump" for name in names
-           if name.partition(":")[0] in KINDS[kind]]
-    if state_jump or "jump" in wanted:
-        raw.append(candidate_of(model, "state", "jump"))
+    raw = [candidate_of(model, name, kind, process, at_rest) for kind in wanted for name in names
+           if name.partition(":")[0] in possible[kind]]
+    of_state = [kind for kind in wanted if "state" in possible[kind]]
+    raw += [candidate_of(model, "state", kind) for kind in dict.fromkeys([*of_state, *[STATE_JUMP] * state_jump])]
     excluded: dict[str, str] = {}
     found = [kept for candidate in raw for kept in _seen(steady, candidate, excluded)]
     if not found:
@@ -306,13 +281,13 @@ def dictionary(
     listed = Dictionary(model, steady, merged, excluded, sines, unknown)
     changes = []
     for name, fault in (schedules or {}).items():
-        if fault.kind != "schedule":
+        if fault.A is None and fault.B is None:
             raise StructureError(f"{name}: a fault of kind {fault.kind!r}; it must be Fault.schedule(A=, B=).")
         place, label = f"process:{name}", f"process:{name} schedule"
         if label in listed.labels:
             raise StructureError(f"{label} is in the dictionary already.")
         none = np.zeros((model.nx, 1)), np.zeros((model.l, 1))
-        changes.append(Candidate(place, "schedule", *none, members=(label,), places=(place,), schedule=fault))
+        changes.append(Candidate(place, fault.kind, *none, members=(label,), places=(place,), schedule=fault))
     return listed.with_candidates(changes) if changes else listed
 
 
@@ -332,7 +307,7 @@ def candidate_of(
     """Return a candidate by its name and kind; arguments and errors as of `place_of` and `dictionary`."""
     into_state, into_output = place_of(model, name, None, process)
     new = Candidate(name, kind, into_state, into_output, places=(name,))
-    if kind in ("loss", "stuck") and name.startswith("actuator"):
+    if new.fault_kind.driven and name.startswith("actuator"):
         c = channel_of(model.inputs, name)
         columns = tuple(i for i, of in enumerate(model.input_of) if of == c)
         new = replace(new, columns=columns, zero=(zeros or {}).get(name.partition(":")[2]))
@@ -359,7 +334,7 @@ def _horizon(steady: Predictor) -> int:
 
 def response(steady: Predictor, candidate: Candidate, count: int) -> Array:
     """Return the signature (N, l, d) from the onset on; that of a bias for a candidate without a signature."""
-    course = course_of(candidate.kind, np.arange(count))[:, None, None]
+    course = candidate.fault_kind.progress(np.arange(count))[:, None, None]
     return steady.whitened(steady.respond(course * candidate.into_state, course * candidate.into_output))
 
 

@@ -2,12 +2,12 @@
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from optid.arrays import Array, as_list, compact, one_or_all
-from optid.data.record import Data
+from optid.data.record import Data, Experiment
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
@@ -17,7 +17,6 @@ from optid.models.roots import spectral_radius
 from optid.phrases import p_value
 
 if TYPE_CHECKING:
-    from optid.faults.nuisance import ModelUncertainty, Nuisance
     from optid.models import HammersteinSS
 
 LAGS = 20
@@ -154,6 +153,42 @@ def predictor(model: "HammersteinSS") -> Predictor:
 
 
 @dataclass(frozen=True, eq=False)
+class Nuisance:
+    """(I + M M')^(-1/2) = I - U diag(1 - 1/sqrt(1 + s^2)) U' with the singular values s of M.
+
+    Attributes:
+        U: (N l, q) orthonormal.
+        s: (q,).
+        unknown: number of unknown axes beside the initial state.
+    """
+
+    U: Array
+    s: Array
+    unknown: int = 0
+
+    @property
+    def log_scale(self) -> float:
+        """Logarithm of the determinant of (I + M M')^(1/2)."""
+        return 0.5 * float(np.sum(np.log1p(self.s**2)))
+
+    def __call__(self, r: Array) -> Array:
+        """Whiten (N, l) or (N, l, d)."""
+        flat = r.reshape(len(self.U), -1)
+        drop = 1 - 1 / np.sqrt(1 + self.s**2)
+        return np.asarray((flat - self.U @ (drop[:, None] * (self.U.T @ flat))).reshape(r.shape))
+
+
+class UncertainInnovations(Protocol):
+    """What whitening asks of the uncertainty of an identified model: a predictor, and its effect on a window."""
+
+    predictor: Predictor
+
+    def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
+        """Return the effect on the innovations of an experiment with readings (N, l) from a state (n,)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
 class Whitened:
     """Whitened innovations of one record.
 
@@ -172,7 +207,7 @@ class Whitened:
     present: Array
     predictor: Predictor
     outputs: tuple[str, ...]
-    nuisance: "Nuisance | None" = None
+    nuisance: Nuisance | None = None
     states: Array | None = None
 
     def seen(self, signature: Array) -> Array:
@@ -216,7 +251,7 @@ def check_window(
 
 
 def whiten(
-    model: "HammersteinSS", data: Data, *, x0: Any = "fit", uncertainty: "ModelUncertainty | None" = None,
+    model: "HammersteinSS", data: Data, *, x0: Any = "fit", uncertainty: UncertainInnovations | None = None,
     scale: Predictor | None = None,
 ) -> Any:
     """Return the whitened innovations of a record; a tuple for several experiments.
@@ -312,8 +347,8 @@ class Health:
         if not self.white:
             raise DataError(
                 f"The innovations of the healthy record are not white (p-value {p_value(self.p_value)}): thresholds "
-                "from this model would be wrong. Fit the model again, calibrate the thresholds on healthy records "
-                "(empirical_thresholds), or include the uncertainty of the identified model (model_uncertainty)."
+                "from this model would be wrong. Fit the model again, include the uncertainty of the identified "
+                "model (model_uncertainty), or watch with Monitor(..., healthy=record), which takes the noise from it."
             )
         if rescale:
             covariance = np.linalg.solve(steady.root, np.linalg.solve(steady.root, self.covariance).T)

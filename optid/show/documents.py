@@ -23,8 +23,8 @@ from optid.show.sections import (
     Banner,
     Charts,
     Code,
-    Columns,
     Document,
+    FactColumns,
     Findings,
     Fold,
     Heading,
@@ -65,7 +65,7 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
     lead = " · ".join(part for part in (fit.formulation, fit.data.name, _length(fit.data)) if part)
     curves = cache(lambda: responses.fit_responses(fit, estimates.uncertainty(fit)[0]))
     sections = [
-        *_record(fit.record_findings),
+        *record_findings(fit.record_findings),
         Section("trust", "", lambda: _trust(fit, fit.verdict if judged is None else judged, test, advise)),
         Section("dynamics", "Dynamics", lambda: _dynamics(fit, curves)),
         Section("optimum", "", lambda: _optimum(fit)),
@@ -78,7 +78,7 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
             summary.record_facts(fit), *([summary.channel_table(fit.data)] if isinstance(fit.data, Data) else [])],
             page_only=True),
         Section("solver", "Solver and times", lambda: [summary.solver_facts(fit)], page_only=True),
-        Section("reproduce", "Reproduce", lambda: _reproduce(
+        Section("reproduce", "Reproduce", lambda: reproduce(
             "\n".join(part for part in (command, summary.call(fit)) if part), str(fit)), page_only=True),
     ]
     judgeable = isinstance(fit.data, Data)
@@ -115,7 +115,7 @@ def _model(fit: "Fit") -> list[Any]:
         *([Fold("f in its gauge", [*([Charts(drawn)] if drawn else []), *gauged])] if gauged else [])]
 
 
-def _record(findings: Sequence[str]) -> list[Section]:
+def record_findings(findings: Sequence[str]) -> list[Section]:
     """Return the section of what reading the record derived, assumed or repaired; none where there is nothing."""
     return [Section("record", RECORD, [Findings(findings)])] if findings else []
 
@@ -131,7 +131,7 @@ def record_document(data: Data, *, command: str = "") -> Document:
     channels = f"{', '.join(data.inputs)} to {', '.join(data.outputs)}"
     lead = " · ".join([_length(data), f"every {data.interval}", channels])
     return Document(data.name or "Record", lead, [
-        *_record((*data.findings, *informativity(data).findings)),
+        *record_findings((*data.findings, *informativity(data).findings)),
         Section("channels", "Channels", lambda: [summary.channel_table(data)]),
         Section("tests", "What the record tells", lambda: [informativity_table(informativity(data))]),
         Section("figures", "Figures", drawn, page_only=True),
@@ -177,7 +177,7 @@ def _optimum(fit: "Fit") -> list[Any]:
     right = [(name, value) for name, value in summary.certificate_facts(fit)
              if name in ("Objective", "Bound", "Relative gap")]
     right += [(name, value) for name, value in summary.solver_facts(fit) if name in ("Solver", "Iterations", "Total")]
-    return [Banner(tone, f"Solution: {word}", sentence, tuple(cards)), Columns(summary.record_facts(fit), right),
+    return [Banner(tone, f"Solution: {word}", sentence, tuple(cards)), FactColumns(summary.record_facts(fit), right),
             *filter(None, [summary.steps_table(fit)]), *([Notes(fit.findings)] if fit.findings else [])]
 
 
@@ -230,7 +230,8 @@ def validation_parts(checked: Validation) -> list[Any]:
     return [*checks.validation_tables(checked), *notes, Charts(charts.correlation_charts(checked))]
 
 
-def _reproduce(call: str, text: str) -> list[Any]:
+def reproduce(call: str, text: str) -> list[Any]:
+    """Return the parts that say how to make a result again, what made it, and its text."""
     from optid.show.page import versions
 
     return [Code(call), versions(), Fold("Result as plain text", [Code(text)])]
@@ -270,7 +271,7 @@ def validation_document(checked: Validation) -> Document:
     tone = "bad" if not worst >= USELESS_FIT else "fair" if worst < POOR_FIT or not checked.passed else "good"
     banner = Banner(tone, f"Residual tests: {'PASS' if checked.passed else 'FAIL'}", sentence + ".", fits)
     return Document(f"Validation on {checked.data}" if checked.data else "Validation", "", [
-        *_record(checked.findings),
+        *record_findings(checked.findings),
         Section("trust", "", [banner]), Section("tests", "Errors and tests", lambda: validation_parts(checked))])
 
 
@@ -299,12 +300,12 @@ def comparison_document(found: "Comparison", *, command: str = "") -> Document:
 
     call = command or f"optid.compare_models(models, data, horizon={found.horizon})"
     return Document(title, lead, [
-        *_record(found.data.findings),
+        *record_findings(found.data.findings),
         Section("fits", "Fits", lambda: [checks.comparison_table(found), checks.facts_table(found)]),
         Section("dynamics", "Dynamics", lambda: comparison_dynamics(found, curves())),
         Section("figures", "Figures", figures, page_only=True),
         Section("validation", "Each model by itself", each, page_only=True),
-        Section("reproduce", "Reproduce", lambda: _reproduce(call, str(found)), page_only=True)])
+        Section("reproduce", "Reproduce", lambda: reproduce(call, str(found)), page_only=True)])
 
 
 def comparison_dynamics(found: "Comparison", curves: tuple[Any, list[str]]) -> list[Any]:
@@ -318,7 +319,8 @@ def order_document(study: "OrderStudy") -> Document:
     """Return the document of a study of the order."""
     notes = [Notes([*study.reasons, *study.notes])]
     return Document(f"Order of {study.data}" if study.data else "Order", f"recommended: nx = {study.nx}", [
-        *_record(study.findings), Section("order", "Recommendation", [Banner("plain", f"nx = {study.nx}"), *notes,
+        *record_findings(study.findings),
+        Section("order", "Recommendation", [Banner("plain", f"nx = {study.nx}"), *notes,
                                             Charts(charts.order_charts(study)),
                                             Fold("Tables", [Code(order_text(study))])])])
 

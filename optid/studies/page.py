@@ -8,9 +8,9 @@ import numpy as np
 from markupsafe import Markup
 
 from optid import __version__
-from optid.phrases import plural
+from optid.phrases import plural, short
 from optid.show.page import embedded, scripts, template, versions
-from optid.show.wording import Table, number, seconds, short
+from optid.show.wording import Table, number, seconds
 from optid.studies.payload import page_payload
 from optid.studies.storage.rows import OUTCOMES
 from optid.studies.verdicts.advice import choice_of_solver, evidence

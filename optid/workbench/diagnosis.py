@@ -8,14 +8,11 @@ import numpy as np
 
 from optid.data.record import Data
 from optid.errors import StructureError
+from optid.show import diagnosis_words as words
 from optid.show.charts import time_axis
+from optid.show.diagnosis import TONES, diagnosis_charts
 from optid.show.page import coded
-from optid.show.sections import Axis, Chart, Series
 from optid.workbench.views import SHOWN
-
-TONES = {"healthy": "good", "faulty": "bad"}
-MOST = 8
-"""Candidates whose energy is drawn: those that explain most."""
 
 
 def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -27,7 +24,6 @@ def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, An
         asked: ``experiment``, ``window``, ``kinds`` of faults, ``without`` (labels removed from the dictionary).
     """
     from optid.faults import diagnose, dictionary
-    from optid.faults.diagnosis import words
 
     model = getattr(source, "model", source)
     if model.structure != "ss" or model.noise is None:
@@ -52,26 +48,4 @@ def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, An
     return {"word": f"{found.verdict}: {words.headline(found)}", "tone": TONES.get(found.verdict, "fair"),
             "sentences": [*words.explained(found, notes=False), *counted],
             "labels": list(whole.labels), "answers": answers,
-            "charts": _charts(found, whole_record, first)}
-
-
-def _charts(found: Any, record: Data, first: int) -> list[dict[str, Any]]:
-    seen, x = found.evidence, time_axis(record)
-    k = record.experiments[0].start + record.dt * (first + np.arange(len(seen.r), dtype=float))
-    charts = []
-    for o, name in enumerate(found.outputs or [f"y{o + 1}" for o in range(seen.r.shape[1])]):
-        r = np.where(seen.present[:, o], seen.r[:, o], np.nan)
-        series = [Series("innovation", k, r, colour="muted", width=1.0)]
-        if seen.fitted[:, o].any():
-            series.append(Series("best explanation", k, seen.fitted[:, o], colour="c1", width=2.0))
-        charts.append(Chart(f"Whitened innovations of {name}", "Mostly between -2 and 2 when healthy.", x,
-                            Axis("standard deviations"), series, "fault", height=220))
-    if seen.labels:
-        peaks = np.nanmax(np.where(np.isnan(seen.gains), -np.inf, seen.gains), axis=1)
-        order = [int(i) for i in np.argsort(-peaks)[:MOST] if np.isfinite(peaks[i])]
-        series = [Series(seen.labels[i], k, seen.gains[i], colour=f"c{j}", width=1.8) for j, i in enumerate(order)]
-        charts.append(Chart("Likelihood of each fault by its onset", "Energy that a fault explains beyond the "
-                            "alarm threshold; rarely above zero without a fault.",
-                            replace(x, title=x.title.replace("time", "onset").replace("sample", "onset (sample)")),
-                            Axis("energy beyond the threshold"), series, "fault", height=320))
-    return [coded(one, SHOWN) for one in charts]
+            "charts": [coded(one, SHOWN) for one in diagnosis_charts(found, time_axis(whole_record), first)]}

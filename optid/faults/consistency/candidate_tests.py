@@ -14,7 +14,7 @@ from optid.core.problem import Problem
 from optid.core.terms import Values
 from optid.errors import StructureError
 from optid.faults.consistency.bounded_noise import BoundedWindow, Membership, ParityProof, parity_proof
-from optid.faults.signatures import Candidate, Dictionary, course_of
+from optid.faults.signatures import Candidate, Dictionary
 from optid.program.solution import Bound, Solution, relative_gap
 from optid.solving.solve import Evidence, Procedure
 
@@ -99,15 +99,9 @@ def _proof_of(solution: Solution) -> ParityProof | None:
 
 def _between(candidate: Candidate, unit: Signature, first: int, last: int) -> Signature:
     """Basis that contains the signature for every onset in [first, last]; for last = N every time course."""
-    k = np.arange(len(unit[0]))
-    courses = [k == at for at in range(first, last)]
-    if last < k.size:
-        after = course_of(candidate.kind, k - last)
-        courses.append(after)
-        if first < last and np.ptp(after[last:]) > 0 and after[-1]:  # of a drift that began before: its level there
-            courses.append(k >= last)
-    shapes = np.array(courses, dtype=float)
-    state, output = (np.einsum("ck,kid->kicd", shapes, part).reshape(k.size, part.shape[1], -1) for part in unit)
+    count = len(unit[0])
+    shapes = np.array(candidate.fault_kind.courses(first, last, count), dtype=float)
+    state, output = (np.einsum("ck,kid->kicd", shapes, part).reshape(count, part.shape[1], -1) for part in unit)
     sizes = np.maximum(np.abs(state[1:]).max(axis=(0, 1), initial=0.0), np.abs(output).max(axis=(0, 1), initial=0.0))
     seen = sizes > 0
     return state[:, :, seen] / sizes[seen], output[:, :, seen] / sizes[seen]

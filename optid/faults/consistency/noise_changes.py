@@ -251,10 +251,10 @@ def noise_test(
 
 def noise_places(found: Dictionary) -> list[tuple[str, Candidate]]:
     """Return the label and the candidate of every place where noise may increase."""
-    named = [c for c in found.candidates if c.kind == "noise"]
+    named = [c for c in found.candidates if c.fault_kind.noise]
     places = by_place(named or [c for c in found.candidates if not c.name.startswith("state")])
     chosen = [candidates[0] for candidates in places.values()]
-    return [(c.label if c.kind == "noise" else " | ".join(f"{place} noise" for place in c.places), c) for c in chosen]
+    return [(c.label if c.fault_kind.noise else " | ".join(f"{place} noise" for place in c.places), c) for c in chosen]
 
 
 def _variance(found: Dictionary, candidate: Candidate) -> float:

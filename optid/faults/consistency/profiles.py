@@ -159,16 +159,16 @@ def course_problem(found: "Scan", label: str) -> CourseProblem:
         StructureError: a candidate with several magnitudes or of noise, a window that is too long.
     """
     candidate: Candidate = found.dictionary[label]
-    if candidate.kind == "noise":
-        raise StructureError(f"{candidate.label}: noise has no course; test its covariance (noise_test).")
-    if candidate.kind == "stuck" or candidate.into_state.shape[1] != 1:
+    if candidate.fault_kind.without_course:
+        raise StructureError(f"{candidate.label}: {candidate.fault_kind.without_course}.")
+    if candidate.dimension != 1 or candidate.into_state.shape[1] != 1:
         raise StructureError(
             f"{candidate.label} has several magnitudes: a profile is the course of one. Take the bias or the loss of "
             "the channel, or a direction process={...} of the state.")
     count = len(found.whitened.r)
     if count > LONGEST:
         raise StructureError(f"{count} samples are too many for a profile ({LONGEST}): use a shorter window.")
-    if candidate.kind == "loss" and found.u is None:
+    if candidate.fault_kind.driven and found.u is None:
         raise StructureError(f"{candidate.label}: its course depends on the input: scan the window with u.")
     matrix = waveform_matrix(found.dictionary, candidate, found.whitened, u=found.u)
     if not np.abs(matrix).max(initial=0.0) > 0:

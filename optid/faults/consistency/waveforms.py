@@ -128,8 +128,8 @@ def waveform_test(
     start = start_matrix(whitened) if free_start else np.zeros((whitened.r.size, 0))
     tested, untested = [], {}
     for candidate in found.candidates:
-        if candidate.kind == "noise":
-            untested[candidate.label] = "noise has no course (see noise_test)"
+        if candidate.fault_kind.without_course:
+            untested[candidate.label] = candidate.fault_kind.without_course
         elif candidate.into_state.shape[1] >= found.model.l:
             untested[candidate.label] = "as many directions as outputs explain anything"
         else:
@@ -155,7 +155,7 @@ def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened,
     count = len(whitened.r)
     state, output = (np.broadcast_to(part, (count, *part.shape)) for part in
                      (candidate.into_state, candidate.into_output))
-    if u is not None and candidate.kind == "loss":
+    if u is not None and candidate.fault_kind.driven:
         state, output = found.additions(candidate, count, 0, u)
     d, at = state.shape[2], np.arange(count - onset)
     into_state, into_output = (np.zeros((count, part.shape[1], count - onset, d)) for part in (state, output))

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 UNLISTED = 0.1
 """Prior of a fault outside the dictionary, relative to one inside."""
 
+LEAK = "bias"
+"""Kind of the disturbance of unknown direction that always competes."""
+
 UNKNOWN_DIRECTION = "process"
 """Name of a disturbance whose direction is estimated."""
 
@@ -43,16 +46,13 @@ def with_unlisted_candidates(found: Dictionary) -> Dictionary | None:
     They are actuators with a loss without a stated zero and without a stuck candidate, and, where "none of these" is a
     possible answer, the disturbance of unknown direction.
     """
-    stuck = {c.name for c in found.candidates if c.kind == "stuck"}
-    more = [
-        replace(c, kind="stuck") for c in found.candidates
-        if c.kind == "loss" and c.columns and c.zero is None and c.name not in stuck
-    ]
-    known = found.model.l > 1 or any(c.kind != "frozen" for c in found.candidates)
+    wide = {c.name for c in found.candidates if c.has_constants}
+    more = [c.widened for c in found.candidates
+            if c.fault_kind.loses and c.columns and c.zero is None and c.name not in wide]
+    known = found.model.l > 1 or any(not c.fault_kind.waveform for c in found.candidates)
     if found.unknown and known and all(c.name != UNKNOWN_DIRECTION for c in found.candidates):
-        drifts = any(c.kind == "drift" for c in found.candidates) and not declares_process(found)
-        kinds = ["bias", *(["drift"] if drifts else [])]
-        more += [candidate_of(found.model, UNKNOWN_DIRECTION, kind) for kind in kinds]
+        listed = {} if declares_process(found) else {c.kind: None for c in found.candidates if c.fault_kind.leaks}
+        more += [candidate_of(found.model, UNKNOWN_DIRECTION, kind) for kind in dict.fromkeys([LEAK, *listed])]
     sines = np.full((len(more), len(more)), np.nan)
     return replace(found, candidates=tuple(more), excluded={}, sines=sines) if more else None
 
@@ -65,9 +65,9 @@ def declares_process(found: Dictionary) -> bool:
 def same_at_process(found: Explanation) -> list[Explanation]:
     """Return the disturbance of the process that has the same effect as an actuator; none for other explanations."""
     (c,) = found.candidates
-    if c.kind not in ("bias", "drift") or not c.name.startswith("actuator:") or c.into_output.any():
+    if not c.fault_kind.leaks or not c.name.startswith("actuator:") or c.into_output.any():
         return []
-    label = UNKNOWN_DIRECTION + " drift" * (c.kind == "drift")
+    label = c.fault_kind.own_label(UNKNOWN_DIRECTION)
     other = replace(c, name=UNKNOWN_DIRECTION, members=(label,), places=(UNKNOWN_DIRECTION,))
     return [found._replace(logs=found.logs + np.log(UNLISTED), candidates=(other,), entries=found.entries or (c,))]
 
@@ -78,11 +78,12 @@ def split_by_kind(found: Explanation, listed: Sequence[Candidate]) -> list[Expla
     Of several faults every broken actuator is taken apart, in all combinations.
     """
     family = found.candidates[0]
-    if len(found.candidates) == 1 and family.kind == "loss" and family.columns and not family.constants:
+    alone = len(found.candidates) == 1 and family.fault_kind.loses
+    if alone and family.columns and not family.has_constants:
         return [found._replace(logs=np.logaddexp(found.logs, _all_lost(found, 0)) - np.log(2))]
     result, first = [found], 0
     for number, family in enumerate(found.candidates):
-        if family.kind == "stuck":
+        if family.has_constants:
             result = [part for one in result for part in _kinds(one, number, first, listed)]
         first += family.dimension
     return result
@@ -91,14 +92,16 @@ def split_by_kind(found: Explanation, listed: Sequence[Candidate]) -> list[Expla
 def _kinds(found: Explanation, number: int, first: int, listed: Sequence[Candidate]) -> list[Explanation]:
     """Return the kinds of a broken actuator, one of the candidates, whose share is the magnitude `first`."""
     family, entries = found.candidates[number], found.entries or found.candidates
-    kinds = {c.kind: c for c in listed if c.name == family.name}
     result = []
-    if "stuck" in kinds:
-        result.append(_stuck(found, first)._replace(entries=entries))
-    if "loss" in kinds and kinds["loss"].zero is None:
-        lost = replace(family, kind="loss", constants=True, members=(f"{family.name} loss",))
-        candidates = (*found.candidates[:number], lost, *found.candidates[number + 1 :])
-        result.append(found._replace(candidates=candidates, entries=entries))
+    for c in sorted(listed, key=lambda c: not c.has_constants):
+        if c.name != family.name or not c.fault_kind.loses:
+            continue
+        if c.has_constants:
+            result.append(_stuck(found, first)._replace(entries=entries))
+        elif c.zero is None:
+            lost = replace(family, kind=c.kind, constants=True, members=(c.own_label,))
+            candidates = (*found.candidates[:number], lost, *found.candidates[number + 1 :])
+            result.append(found._replace(candidates=candidates, entries=entries))
     return result
 
 

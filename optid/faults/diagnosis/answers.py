@@ -11,10 +11,9 @@ from optid.arrays import Array
 from optid.data.timeline import Timeline
 from optid.errors import StructureError
 from optid.faults.signatures import Candidate
+from optid.registry import Rendered, render
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from optid.faults.consistency.profiles import Profile
     from optid.faults.search.scanning import Scan
 
@@ -73,13 +72,11 @@ class Estimate:
 
     def __str__(self) -> str:
         """State label, onset and size, with the intervals."""
-        from optid.faults.diagnosis.words import estimate_line
-
-        return estimate_line(self)
+        return render(self)
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class FaultAnswer:
     """One explanation of the record.
 
     Attributes:
@@ -116,19 +113,29 @@ class Certificate:
     """Evidence that the best answer is the best.
 
     Attributes:
-        kind: "exhaustive" (every candidate and onset was tried), "grid" (every candidate at some onsets), "duality gap"
-            (of a convex programme), "infeasible healthy" (no healthy record within the bounds of the noise), "flat
+        basis: "exhaustive" (every candidate and onset was tried), "grid" (every candidate at some onsets), "duality
+            gap" (of a convex programme), "infeasible healthy" (no healthy record within the bounds of the noise), "flat
             line" (identical readings), or "none".
         value: energy explained beyond the threshold, duality gap, the least factor of the bounds of the noise, or the
             number of identical readings.
         runner_up_margin: twice the log-odds of the best answer against the next one; inf where there is no other.
-        parity_vector: (N, l) multipliers of the proof "infeasible healthy"; None for the other kinds.
+        parity_vector: (N, l) multipliers of the proof "infeasible healthy"; None without it.
     """
 
-    kind: str
+    basis: str
     value: float
     runner_up_margin: float = float("inf")
     parity_vector: Array | None = None
+
+    @property
+    def proved(self) -> bool:
+        """Whether there is evidence."""
+        return self.basis != "none"
+
+    @property
+    def excludes_health(self) -> bool:
+        """Whether it proves that no healthy plant made the record."""
+        return self.parity_vector is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +162,7 @@ class Remaining:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class SearchEvidence:
     """Innovations and statistics of a diagnosis, for figures and for the course of a fault.
 
     Attributes:
@@ -175,8 +182,8 @@ class Evidence:
     search: "Scan | None"
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(Rendered):
     """Diagnosis of a record; `print`, `explain()` or `plot()` it.
 
     Attributes:
@@ -204,8 +211,8 @@ class Diagnosis:
 
     verdict: str
     detected: bool
-    best: Answer | None
-    candidates: tuple[Answer, ...]
+    best: FaultAnswer | None
+    candidates: tuple[FaultAnswer, ...]
     p_value: float
     certificate: Certificate
     untestable: Mapping[str, str]
@@ -218,7 +225,7 @@ class Diagnosis:
     outputs: tuple[str, ...] = ()
     dt: float = 1.0
     remaining: Remaining | None = None
-    evidence: Evidence | None = field(default=None, repr=False)
+    evidence: SearchEvidence | None = field(default=None, repr=False)
     timeline: Timeline = Timeline()
     findings: tuple[str, ...] = ()
 
@@ -253,17 +260,9 @@ class Diagnosis:
         """Its interval, (d, 2)."""
         return None if self.best is None else self.best.faults[0].size_interval
 
-    def __str__(self) -> str:
-        """Print the verdict, the set with probabilities, the estimates and the proof, in 80 columns."""
-        from optid.faults.diagnosis.words import printed
-
-        return printed(self)
-
     def explain(self) -> str:
         """State in three sentences the result, its probability and its evidence."""
-        from optid.faults.diagnosis.words import explained
-
-        return " ".join(explained(self))
+        return render(self, "sentences")
 
     def profile(self, prior: str = "auto", **how: Any) -> "Profile":
         """Estimate the course over time of the most probable fault, whatever its kind in the search.
@@ -275,23 +274,13 @@ class Diagnosis:
         Raises:
             StructureError: no fault, several at once, one without a course, or a diagnosis read from a file.
         """
-        from optid.faults.search.programmes import profile
+        from optid.faults.programmes import profile
 
         if self.best is None or len(set(self.best.labels)) != 1:  # one place may change several times
             raise StructureError("A course is estimated for one fault; this diagnosis names none, or several at once.")
         if self.evidence is None or self.evidence.search is None:
             raise StructureError("The record is not in a diagnosis that was read from a file: diagnose it again.")
         return profile(self.evidence.search, self.best.faults[0].label, prior, **how)
-
-    def plot(self) -> "Figure":
-        """Draw the innovations, the statistic over onset and candidate, and the signature of the best answer.
-
-        Raises:
-            StructureError: a diagnosis read from a file: the record is not in it.
-        """
-        from optid.faults.diagnosis.picture import draw
-
-        return draw(self)
 
     def to_dict(self) -> dict[str, Any]:
         """Return it in JSON types, without the evidence."""

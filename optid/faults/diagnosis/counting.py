@@ -14,8 +14,8 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.faults.diagnosis.posterior import Explanation, bounded_shares, least_squares, marginal
-from optid.faults.faults import place_of
 from optid.faults.nuisance import ModelUncertainty, Nuisance
+from optid.faults.places import place_of
 from optid.faults.signatures import Candidate
 
 if TYPE_CHECKING:

@@ -35,8 +35,8 @@ ONSETS = 12
 
 def without_signature(found: Dictionary) -> tuple[list[Candidate], list[Candidate]]:
     """Return the frozen sensors and the noises of a dictionary."""
-    frozen = [c for c in found.candidates if c.kind == "frozen"]
-    return frozen if found.model.l > 1 else [], [c for c in found.candidates if c.kind == "noise"]
+    frozen = [c for c in found.candidates if c.fault_kind.waveform]
+    return frozen if found.model.l > 1 else [], [c for c in found.candidates if c.fault_kind.noise]
 
 
 def courses(found: Dictionary, white: Whitened, part: Experiment) -> list[Explanation]:

@@ -10,10 +10,10 @@ from optid.data.record import Data
 from optid.data.timeline import Timeline
 from optid.errors import StructureError
 from optid.faults.diagnosis.alternatives import final_effect
-from optid.faults.diagnosis.answers import Answer, Certificate, Diagnosis, Estimate, Evidence
+from optid.faults.diagnosis.answers import Certificate, Diagnosis, Estimate, FaultAnswer, SearchEvidence
 from optid.faults.diagnosis.courses import LONGEST
 from optid.faults.diagnosis.posterior import estimates
-from optid.faults.diagnosis.ranking import NOTHING, Fit, explain_record
+from optid.faults.diagnosis.ranking import NOTHING, RankedExplanation, explain_record
 from optid.faults.diagnosis.record_search import Question, RecordSearch, search_record
 from optid.faults.diagnosis.records import (
     lost_sensors,
@@ -128,27 +128,28 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
         notes.append("With one output only faults with a known course are isolable.")
     timeline = record.timelines[number]
     answers = _answers(seen, fits, stuck, timeline)
-    certificate = ranking.certificate if fits or ranking.certificate.kind == "infeasible healthy" else NOTHING
+    certificate = ranking.certificate if fits or ranking.certificate.excludes_health else NOTHING
     if stuck and not fits:
         certificate = Certificate("flat line", float(max(line.count for line in lines)))
     remaining = None
     if alarm:
         remaining = ranking.fits[0].remaining if ranking.fits else seen.healthy
     verdict = "untestable" if seen.lost and not seen.tested else "unknown" if alarm else "healthy"
-    if alarm and model.l == 1 and any(c.kind == "frozen" for c in seen.dictionary.candidates):
+    if alarm and model.l == 1 and any(c.fault_kind.waveform for c in seen.dictionary.candidates):
         verdict = "not isolable"
     white, search = seen.whitened, seen.search
     fitted = fits[0].fitted if fits else np.zeros_like(white.r)
     return Diagnosis(
         verdict="faulty" if stuck or fits else verdict,
         detected=bool(alarm or stuck),
-        best=answers[0] if answers and certificate.kind != "none" else None, candidates=answers,
+        best=answers[0] if answers and certificate.proved else None, candidates=answers,
         p_value=0.0 if stuck else first.p_value, certificate=certificate,
         untestable=dict(seen.lost) | _not_searched(seen), window=len(white.r), false_alarm=asked.false_alarm,
         coverage=asked.coverage, method=asked.method,
         status=timeline.with_times(" ".join(note for note in notes if note)),
         model=model.title, outputs=model.outputs, dt=model.dt, remaining=remaining,
-        evidence=Evidence(white.r, white.present, fitted, seen.gains, () if search is None else search.labels, search),
+        evidence=SearchEvidence(white.r, white.present, fitted, seen.gains, () if search is None else search.labels,
+                                search),
         timeline=timeline, findings=record.findings,
     )
 
@@ -159,25 +160,26 @@ def _not_searched(seen: RecordSearch) -> dict[str, str]:
     lost: dict[str, str] = {}
     if model.feedback or np.any(model.L):
         why = "the model feeds readings back into its state, so that a faulty one changes the plant"
-        lost = {c.label: why for c in found.candidates if c.kind == "loss" and not c.columns}
+        lost = {c.label: why for c in found.candidates if c.is_sensor_gain}
     if seen.whitened.r.size > LONGEST:
         why = f"the record has more than {LONGEST} readings, too many for this kind: cut it"
-        return lost | {c.label: why for c in found.candidates if c.kind in ("frozen", "noise")}
+        return lost | {c.label: why for c in found.candidates
+                       if c.fault_kind.waveform or c.fault_kind.noise}
     why = "with one output a fault of arbitrary course explains every record"
-    return lost | {c.label: why for c in found.candidates if c.kind == "frozen" and model.l == 1}
+    return lost | {c.label: why for c in found.candidates if c.fault_kind.waveform and model.l == 1}
 
 
-def _answers(seen: RecordSearch, fits: tuple[Fit, ...], stuck: tuple[Estimate, ...], timeline: Timeline
-             ) -> tuple[Answer, ...]:
+def _answers(seen: RecordSearch, fits: tuple[RankedExplanation, ...], stuck: tuple[Estimate, ...], timeline: Timeline
+             ) -> tuple[FaultAnswer, ...]:
     """Return the set of answers, each with the sensors that repeat one reading."""
     model, result = seen.dictionary.model, []
     if not fits and stuck:
-        return (Answer(tuple(_timed(fault, timeline) for fault in stuck), 1.0, float("inf")),)
+        return (FaultAnswer(tuple(_timed(fault, timeline) for fault in stuck), 1.0, float("inf")),)
     for fit in fits:
         faults = estimates(fit.explanation, seen.asked.coverage, len(fit.fitted), 2 * model.nx)
         faults = tuple(replace(one, effect=final_effect(model, one.name, one.size)) for one in faults)
         merged = sorted((*stuck, *faults), key=lambda fault: fault.onset)
-        result.append(Answer(tuple(_timed(fault, timeline) for fault in merged), fit.probability, fit.gain))
+        result.append(FaultAnswer(tuple(_timed(fault, timeline) for fault in merged), fit.probability, fit.gain))
     return tuple(result)
 
 

@@ -69,7 +69,7 @@ def _wildest(search: Scan) -> tuple[int, int] | None:
     """The reading whose spike is likelier than any candidate of another kind."""
     c, onset, _ = _likeliest(search)
     candidate = search.dictionary.candidates[c]
-    if candidate.kind != "spike" or not search.statistic[c, onset] >= WILD**2:
+    if not candidate.fault_kind.outlier or not search.statistic[c, onset] >= WILD**2:
         return None
     return onset, int(np.flatnonzero(candidate.into_output[:, 0])[0])
 
@@ -83,7 +83,7 @@ def _fitted(search: Scan) -> Array:
 
 def with_spikes(found: Dictionary) -> Dictionary:
     """Return the dictionary with the outliers of all sensors appended."""
-    known = {c.name for c in found.candidates if c.kind == "spike"}
+    known = {c.name for c in found.candidates if c.fault_kind.outlier}
     more = [replace(candidate_of(found.model, f"sensor:{name}", "spike"), bounded_deflection=True)
             for name in found.model.outputs if f"sensor:{name}" not in known]
     return found.with_candidates(more)

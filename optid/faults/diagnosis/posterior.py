@@ -198,7 +198,7 @@ def bounded_shares(candidates: Sequence[Candidate], sizes: Array, covariances: A
     change = np.zeros(len(sizes))
     first = 0
     for candidate in candidates:
-        if candidate.kind in ("loss", "stuck"):
+        if candidate.fault_kind.loses:
             change += np.log(share_bound(sizes[:, first], covariances[:, first, first]))
         first += candidate.dimension
     return change
@@ -242,7 +242,7 @@ def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tu
         sizes, covariances = found.sizes[:, part], found.covariances[:, part, part]
         intervals = mixture_intervals(weights, sizes, np.sqrt(np.einsum("kii->ki", covariances)), coverage)
         size = sizes[best].copy()
-        if candidate.kind in ("loss", "stuck"):  # a share lost lies between 0 and 1
+        if candidate.fault_kind.loses:  # a share lost lies between 0 and 1
             size[0], intervals[0] = np.clip(size[0], 0.0, 1.0), np.clip(intervals[0], 0.0, 1.0)
         mean = weights @ sizes
         spread = np.einsum("k,ki,kj->ij", weights, sizes - mean, sizes - mean)

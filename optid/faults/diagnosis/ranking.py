@@ -8,13 +8,13 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import SolverFailed, StructureError
-from optid.faults.consistency.leftover import UNFIT, further_fault, remainder_test
 from optid.faults.diagnosis.alternatives import UNLISTED, declares_process, same_at_process, split_by_kind
 from optid.faults.diagnosis.answers import Certificate, Remaining
 from optid.faults.diagnosis.counting import with_model_uncertainty
+from optid.faults.diagnosis.leftover import UNFIT, further_fault, remainder_test
 from optid.faults.diagnosis.posterior import Explanation, several, single, smallest_set
 from optid.faults.diagnosis.record_search import RecordSearch
-from optid.faults.search.programmes import solved
+from optid.faults.programmes import solved
 from optid.faults.search.scanning import scan
 from optid.faults.search.subsets import SubsetSearch, pairs, polish
 
@@ -46,7 +46,7 @@ wrong there says too much (J. W. Miller, D. B. Dunson, J. American Statistical A
 NOTHING = Certificate("none", float("nan"))
 
 
-class Fit(NamedTuple):
+class RankedExplanation(NamedTuple):
     """An explanation with its fit.
 
     Attributes:
@@ -74,7 +74,7 @@ class Ranking(NamedTuple):
         note: a remark for the report.
     """
 
-    fits: tuple[Fit, ...] = ()
+    fits: tuple[RankedExplanation, ...] = ()
     odds: float = float("inf")
     certificate: Certificate = NOTHING
     note: str = ""
@@ -133,7 +133,7 @@ def _exact(seen: RecordSearch, count: int) -> Ranking:
     note = "" if exhaustive else "Two faults were searched on a grid of onsets."
     if not ranking.fits:
         return ranking._replace(note=note)
-    on_grid = any(c.kind == "noise" for c in ranking.fits[0].explanation.candidates)  # whose onsets are sampled
+    on_grid = any(c.fault_kind.noise for c in ranking.fits[0].explanation.candidates)  # whose onsets are sampled
     kind = "exhaustive" if exhaustive and not on_grid else "grid"
     return ranking._replace(certificate=Certificate(kind, ranking.fits[0].gain, ranking.odds), note=note)
 
@@ -192,7 +192,7 @@ def ranked(seen: RecordSearch, explanations: Sequence[Explanation]) -> Ranking:
     return Ranking(tuple(_fit(seen, best[i], float(posterior[i])) for i in chosen), odds)
 
 
-def _fit(seen: RecordSearch, explanation: Explanation, probability: float) -> Fit:
+def _fit(seen: RecordSearch, explanation: Explanation, probability: float) -> RankedExplanation:
     made = explanation.fit_to_window()
     rest = made.rest if explanation.error is None else explanation.error(made.rest)
     further, penalty, search, limits = 1.0, 0.0, seen.search, seen.limits
@@ -206,7 +206,8 @@ def _fit(seen: RecordSearch, explanation: Explanation, probability: float) -> Fi
         elif explanation.search is not None:
             penalty = float(np.nanmax(limits.q))
     left = remainder_test(seen.whitened, rest, seen.dictionary.model.nx + made.magnitudes, further)
-    return Fit(explanation, probability, float(explanation.energies[explanation.best] - penalty), made.fitted, left)
+    gain = float(explanation.energies[explanation.best] - penalty)
+    return RankedExplanation(explanation, probability, gain, made.fitted, left)
 
 
 def _by_programme(seen: RecordSearch) -> Ranking:

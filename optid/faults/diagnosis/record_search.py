@@ -10,9 +10,9 @@ import numpy as np
 from optid.arrays import Array, check_integer, check_probability
 from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError, nearest
-from optid.faults.consistency.leftover import alarm_probability, remainder_test
 from optid.faults.diagnosis.alternatives import with_unlisted_candidates
 from optid.faults.diagnosis.courses import courses, without_signature
+from optid.faults.diagnosis.leftover import alarm_probability, remainder_test
 from optid.faults.diagnosis.outliers import cleaned, with_spikes
 from optid.faults.diagnosis.posterior import Explanation
 from optid.faults.diagnosis.sensor_gains import sensor_gains
@@ -218,8 +218,8 @@ def untestable(found: Scan) -> dict[str, str]:
     result = {}
     for c, candidate in enumerate(found.dictionary.candidates):
         if candidate.columns and found.u is not None:
-            as_stuck, white = replace(candidate, kind="stuck"), found.whitened
-            into_state, into_output = found.dictionary.additions(as_stuck, len(white.r), 0, found.u)
+            white = found.whitened
+            into_state, into_output = found.dictionary.additions(candidate.widened, len(white.r), 0, found.u)
             trace = white.seen(white.predictor.respond(into_state, into_output, white.present))
             flat = trace.reshape(-1, trace.shape[2])
             beside = flat[:, 1:]
@@ -231,6 +231,6 @@ def untestable(found: Scan) -> dict[str, str]:
                     f"no excitation: a complete loss would have a deflection of {deflection:.2g} beside a constant "
                     f"offset, {LEAST:g} is required (smallest Gram eigenvalue {max(value, 0.0):.2g})"
                 )
-        elif candidate.kind not in ("frozen", "noise", "loss") and np.isnan(found.statistic[c]).all():
+        elif (candidate.additive or candidate.columns) and np.isnan(found.statistic[c]).all():
             result[candidate.label] = "it has no effect in this record"
     return result

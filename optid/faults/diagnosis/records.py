@@ -130,7 +130,7 @@ def without_lost_readings(record: Data, number: int) -> tuple[Experiment, tuple[
     for line in lines:
         own = y[line.first + 1 :, record.outputs.index(line.name.partition(":")[2])]
         changes = np.flatnonzero(~np.isnan(own) & (own != line.value))
-        if line.condition != "dead":
+        if not line.is_dead:
             own[: changes[0] if changes.size else None] = np.nan
     return replace(part, y=y) if lines else part, lines
 
@@ -142,12 +142,11 @@ def lost_sensors(lines: Sequence[LostReadings], found: Dictionary, edge: int) ->
     `edge` samples of the start of the record may have begun before it.
     """
     longest = {line.name: line for line in sorted(lines, key=lambda line: line.count)}
-    faults = []
+    known, faults = {(c.kind, place): c for c in reversed(found.candidates) for place in c.places}, []
     for name, line in longest.items():
-        known = [c for c in found.candidates if c.kind == line.condition and name in c.places]
-        candidate = known[0] if known else candidate_of(found.model, name, line.condition)
-        onset, censored = line.first + (line.condition != "dead"), line.first < edge
-        value = np.array([] if line.condition == "dead" else [line.value])
+        candidate = known.get((line.condition, name)) or candidate_of(found.model, name, line.condition)
+        onset, censored = line.first + (not line.is_dead), line.first < edge
+        value = np.array([] if line.is_dead else [line.value])
         faults.append(Estimate(
             candidate.label, name, line.condition, candidate, onset, (0 if censored else onset, onset), censored, value,
             np.stack([value, value], axis=1), np.zeros((value.size, value.size)), float("inf"),

@@ -57,7 +57,7 @@ def sensor_gains(
         return []
     explanations = []
     for candidate in found.candidates:
-        if candidate.kind != "loss" or candidate.columns:
+        if not candidate.is_sensor_gain:
             continue
         gain = SensorGain(found, int(np.flatnonzero(candidate.into_output[:, 0])[0]), white, part)
         if gain.last < 1:

@@ -15,9 +15,6 @@ from optid.faults.diagnosis.alternatives import EXACT
 from optid.faults.diagnosis.posterior import marginal, smallest_set
 from optid.faults.signatures import Candidate
 
-GROUPED = "bias", "loss", "stuck"
-"""Kinds of an actuator that are decided by likelihood."""
-
 SMALL = 0.2
 """A share lost is uniform up to one, or up to this: small losses are as likely, and told beside an offset until they
 are excluded."""
@@ -28,9 +25,9 @@ def searched(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
 
     Where the stuck actuator is a candidate, too, that is the one with the constants.
     """
-    stuck = {c.name for c in candidates if c.kind == "stuck"}
-    return tuple(replace(c, constants=True) if c.kind == "loss" and c.columns and c.zero is None and c.name not in stuck
-                 else c for c in candidates)
+    wide = {c.name for c in candidates if c.has_constants}
+    free = [c.fault_kind.loses and c.columns and c.zero is None and c.name not in wide for c in candidates]
+    return tuple(replace(c, constants=True) if wider else c for c, wider in zip(candidates, free))
 
 
 def groups_of(candidates: Sequence[Candidate]) -> tuple[int, ...]:
@@ -42,7 +39,7 @@ def groups_of(candidates: Sequence[Candidate]) -> tuple[int, ...]:
 
 def is_grouped(candidate: Candidate) -> bool:
     """Whether the kind of a candidate is decided by likelihood."""
-    return candidate.kind in GROUPED
+    return candidate.fault_kind.share is not None
 
 
 def kinds(candidate: Candidate, sizes: Array, covariance: Array, listed: Sequence[Candidate]) -> dict[str, float]:
@@ -61,14 +58,12 @@ def kinds(candidate: Candidate, sizes: Array, covariance: Array, listed: Sequenc
         return {candidate.label: float(marginal(np.array([energy]), sizes.size)[0])}
     share, variance = float(sizes[0]), max(float(covariance[0, 0]), EXACT)
     offset = float(marginal(np.array([energy - share**2 / variance]), sizes.size - 1)[0])
-    own = {c.kind: c.label for c in listed if c.name == candidate.name and c.kind in GROUPED}
-    evidence = {
-        "bias": offset, "stuck": offset + (share**2 - (1 - share) ** 2) / (2 * variance),
-        "loss": offset + share**2 / (2 * variance) + np.log(_lost(share, np.sqrt(variance)) + 1e-300),
-    }
-    if not has_constants(candidate):
-        return {candidate.label: evidence["loss"]}
-    return {label: evidence[kind] for kind, label in own.items()}
+    lost = offset + share**2 / (2 * variance) + np.log(_lost(share, np.sqrt(variance)) + 1e-300)
+    if not candidate.has_constants:
+        return {candidate.label: lost}
+    own = {c.label: c.fault_kind.share for c in listed if c.name == candidate.name}
+    return {label: lost if np.isnan(fixed) else offset + (share**2 - (fixed - share) ** 2) / (2 * variance)
+            for label, fixed in own.items() if fixed is not None}
 
 
 def _lost(share: float, std: float) -> float:
@@ -77,11 +72,6 @@ def _lost(share: float, std: float) -> float:
 
     inside = [float(ndtr((most - share) / std) - ndtr(-share / std)) / most for most in (1.0, SMALL)]
     return float(np.sqrt(2 * np.pi) * std * np.mean(inside))
-
-
-def has_constants(candidate: Candidate) -> bool:
-    """Whether a candidate has a share lost and constants."""
-    return candidate.kind == "stuck" or candidate.constants
 
 
 def likeliest(weights: dict[str, float], coverage: float = 0.95) -> tuple[tuple[str, float], ...]:

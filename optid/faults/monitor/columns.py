@@ -5,16 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from optid.arrays import Array, compact
-from optid.faults.monitor.actuator_kinds import has_constants
-from optid.faults.monitor.search_kernel import DRIFT, DRIVEN, JUMP, LASTING, SearchMemory, Signatures, search
+from optid.faults.kinds import DRIVEN, LASTING
+from optid.faults.monitor.search_kernel import SearchMemory, Signatures, search
 from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
 
 Matrices = tuple[Array, ...]  # transition, output, gain and root of the search
-
-COURSES = {"bias": LASTING, "drift": DRIFT, "jump": JUMP, "spike": JUMP, "loss": DRIVEN, "stuck": LASTING}
-"""The course of the columns of a kind; the loss of a stuck actuator, its last column, is driven."""
 
 SPARE = 8
 """Carried directions that the search has room for, beside twice the widest candidate."""
@@ -72,9 +69,9 @@ class Columns:
 
     def in_order(self, number: int, sizes: Array) -> tuple[float, ...]:
         """Return magnitudes in the order of `Dictionary.signature`: the share lost first."""
-        first = int(has_constants(self.candidates[number]))
+        first = int(self.candidates[number].has_constants)
         found = np.roll(sizes, first)
-        if self.candidates[number].kind in ("loss", "stuck"):  # a share lost lies between 0 and 1
+        if self.candidates[number].fault_kind.loses:  # a share lost lies between 0 and 1
             found[0] = np.clip(found[0], 0.0, 1.0)
         return tuple(found.tolist())
 
@@ -83,10 +80,10 @@ def columns_of(model: HammersteinSS, candidates: tuple[Candidate, ...]) -> Colum
     """Tabulate the candidates of a dictionary of a model."""
     into_state, into_output, course, driven, losses, rest = [], [], [], [], [], []
     for c in candidates:
-        if c.kind != "loss" or c.constants:
+        if c.additive or c.has_constants:
             into_state += list(c.into_state.T)
             into_output += list(c.into_output.T)
-            course += [LASTING if c.constants else COURSES[c.kind]] * c.into_state.shape[1]
+            course += [c.fault_kind.course if c.additive else LASTING] * c.into_state.shape[1]
             driven += [-1] * c.into_state.shape[1]
         if c.columns:
             into_state.append(np.zeros(model.nx))
@@ -94,10 +91,9 @@ def columns_of(model: HammersteinSS, candidates: tuple[Candidate, ...]) -> Colum
             course.append(DRIVEN)
             driven.append(len(losses))
             lost = np.zeros((model.nx + model.l, model.B.shape[1]))
-            lost[:, list(c.columns)] = -np.vstack([c.into_state, c.into_output])
+            lost[:, list(c.columns)] = c.fault_kind.effect * np.vstack([c.into_state, c.into_output])
             losses.append((lost[: model.nx], lost[model.nx :]))
-            rest.append(model.expanded(np.full((1, model.m), c.zero))[0] if c.zero is not None and c.kind == "loss" else
-                        np.zeros(model.B.shape[1]))
+            rest.append(c.rest_values(model))
     size = np.array([c.dimension for c in candidates])
     moving = np.repeat([bool(c.columns) for c in candidates], size)
     return Columns(candidates, tuple(losses), tuple(rest), np.array(into_state), np.array(into_output),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.faults.monitor.actuator_kinds import groups_of, has_constants, is_grouped, kinds, likeliest
+from optid.faults.monitor.actuator_kinds import groups_of, is_grouped, kinds, likeliest
 from optid.faults.monitor.arl import COMMON
 from optid.faults.monitor.columns import Columns, Window
 from optid.faults.monitor.events import Event
@@ -254,7 +254,7 @@ class Decisions:
         labels = [label for label, _ in said]
         if labels != [label for label in self.told if label in weights]:
             event = self._told("revised", now, said, chosen, window)
-        family = [c for c in self.group(chosen) if has_constants(self.columns.candidates[c]) and window.peak[c]]
+        family = [c for c in self.group(chosen) if self.columns.candidates[c].has_constants and window.peak[c]]
         if family and (len(labels) > 1 or not self.columns.candidates[chosen].additive):
             chosen = family[0]
             self.undecided = [one for one in self.undecided if one[0] != chosen] + [[chosen, labels]]
@@ -269,7 +269,7 @@ class Decisions:
         """Return {label: likelihood} of the group of a candidate."""
         logs: dict[str, float] = {}
         here = self.group(number)
-        family = [c for c in here if has_constants(self.columns.candidates[c]) and window.peak[c]]
+        family = [c for c in here if self.columns.candidates[c].has_constants and window.peak[c]]
         for c in here:
             if window.peak[c] and (c in family or not (family and self.columns.candidates[c].additive)):
                 sizes, covariance, _ = window.estimate(c)
@@ -286,7 +286,7 @@ class Decisions:
         candidate = self.columns.candidates[number]
         if not is_grouped(candidate):
             return {self.labels[number]: 0.0}
-        first = int(has_constants(candidate))
+        first = int(candidate.has_constants)
         turned = np.roll(covariance, (first, first), axis=(0, 1))
         return kinds(candidate, np.roll(sizes, first), self.spreads[number] * turned, self.listed)
 
@@ -336,7 +336,7 @@ class Decisions:
         """Return an event with onset and size of its first label; one of no candidate is in the group of the best."""
         same = [c for c, label in enumerate(self.labels) if label == said[0][0] and window.peak[c]]
         here = self.group(same[0] if same else best)
-        family = [c for c in here if has_constants(self.columns.candidates[c]) and window.peak[c]]
+        family = [c for c in here if self.columns.candidates[c].has_constants and window.peak[c]]
         is_offset = bool(same) and self.columns.candidates[same[0]].additive
         number = family[0] if family and not is_offset else (same or [best])[0]
         sizes, _, _ = window.estimate(number)

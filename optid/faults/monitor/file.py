@@ -1,7 +1,7 @@
-"""The state of a monitor on disk, restored bit for bit."""
+"""The state of a monitor on disk, restored bit for bit, for `Monitor.save` and `Monitor.load`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Predictor
 from optid.models.files import from_content, read_state, write_state
 
-if TYPE_CHECKING:
-    from optid.faults.monitor.monitoring import Monitor
-
 VERSION = 5
 """Version of the file."""
 
@@ -25,12 +22,12 @@ PLACES = "into_state", "into_output"
 PREDICTOR = "A", "C", "L", "K", "covariance", "root"
 
 
-def _parts(monitor: "Monitor") -> dict[str, tuple[Any, tuple[str, ...]]]:
+def _parts(monitor: Any) -> dict[str, tuple[Any, tuple[str, ...]]]:
     """The owners of the arrays of the state, by the prefix of their names."""
     return {"search": (monitor.search, Window.KEPT), "plant": (monitor.plant, RunningFilter.KEPT)}
 
 
-def save(monitor: "Monitor", path: str | Path) -> Path:
+def save(monitor: Any, path: str | Path) -> Path:
     """Write dictionary, thresholds and state atomically."""
     found, plant, decisions = monitor.dictionary, monitor.plant, monitor.decisions
     head = {
@@ -50,7 +47,7 @@ def save(monitor: "Monitor", path: str | Path) -> Path:
     return write_state(path, "monitor", VERSION, head, arrays)
 
 
-def load(monitor: "Monitor", path: str | Path, functions: dict[str, Any] | None = None) -> None:
+def load(monitor: Any, path: str | Path, functions: dict[str, Any] | None = None) -> None:
     """Fill an empty monitor; arguments and errors as of `Monitor.load`."""
     try:
         head, _ = read_state(path, "monitor", VERSION, [])

@@ -1,8 +1,9 @@
 """The noise of healthy records: its colour, its size, and the thresholds that it requires."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,12 +15,9 @@ from optid.faults.nuisance import CONFIDENCE, ModelUncertainty, sensitivities
 from optid.faults.ranges import outside, unsure_since
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import OTHER_SCALE, Predictor, health, whiten
-from optid.models import NoiseCovariances
+from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.experiments import in_units_of
 from optid.phrases import p_equals
-
-if TYPE_CHECKING:
-    from optid.faults.monitor.monitoring import Monitor
 
 FEWEST = 20
 """Fewest windows of a healthy record."""
@@ -212,12 +210,19 @@ def _check_rise(factor: float, what: str, levels: list[Array], usual: float, len
     warnings.warn(text + ".", DataWarning, stacklevel=4)
 
 
-def raise_thresholds(monitor: "Monitor", healthy: Data, base: Calibration) -> Calibration:
+def raise_thresholds(base: Calibration, model: HammersteinSS, healthy: Data, watched: Callable[[Array, Array], Array]
+                     ) -> Calibration:
     """Return thresholds with no more alarms on a healthy record than are due: those of `base` times a factor.
 
     A record is rarely long enough for its false-alarm rate to be measured. The factor is one, unless more than a tenth
     of the windows reach the energies that a tenth of the simulated ones reach, or there are more alarms than in 95 % of
     records of this length; then it is the ratio of these energies, or the one that leaves so many alarms.
+
+    Args:
+        base: the thresholds of the monitor.
+        model: the model that it uses.
+        healthy: the record.
+        watched: returns the statistics (N, C) along inputs (N, m) and readings (N, l).
 
     Raises:
         DataError: a record of fewer than 20 windows; a factor above 10.
@@ -227,8 +232,8 @@ def raise_thresholds(monitor: "Monitor", healthy: Data, base: Calibration) -> Ca
     """
     from scipy.special import bdtrik, pdtrik
 
-    window, records = monitor.window, in_units_of(monitor.dictionary.model, healthy).experiments
-    levels = [_blocks(np.max(monitor.watched(part.u, part.y) / base.q, axis=1), window).max(axis=1) for part in records]
+    window, records = base.window, in_units_of(model, healthy).experiments
+    levels = [_blocks(np.max(watched(part.u, part.y) / base.q, axis=1), window).max(axis=1) for part in records]
     largest = np.concatenate(levels)
     if len(largest) < FEWEST:
         raise DataError(

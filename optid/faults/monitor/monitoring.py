@@ -13,15 +13,17 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.faults.kinds import DRIFT
+from optid.faults.monitor import file
 from optid.faults.monitor.actuator_kinds import searched
 from optid.faults.monitor.arl import Calibration, calibrate
-from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
+from optid.faults.monitor.columns import SPARE, Window, columns_of
 from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
 from optid.faults.monitor.healthy_noise import parameter_effect, raise_thresholds, with_noise_of, without_drift
 from optid.faults.monitor.readings import ReadingChecks
 from optid.faults.monitor.running_filter import RunningFilter
-from optid.faults.monitor.search_kernel import DRIFT, expand
+from optid.faults.monitor.search_kernel import expand
 from optid.faults.nuisance import ModelUncertainty, model_uncertainty
 from optid.faults.signatures import Dictionary, dictionary
 from optid.identify.recursive.state import as_block
@@ -125,7 +127,7 @@ class Monitor:
         self._set(found, int(window), seed, rules | ({} if found.unknown else {"odd": np.inf}),
                   None if known is None else known.levels)
         for c in found.candidates:
-            if c.label in self.skipped and c.kind != "loss":  # the gains of sensors are among the kinds by default
+            if c.label in self.skipped and not c.is_sensor_gain:  # the gains of sensors are among the kinds by default
                 warnings.warn(f"{c.label} is not monitored: {self.skipped[c.label]}.", DataWarning, stacklevel=2)
         if thresholds is not None:
             self.calibration = self._given(thresholds, arl0)
@@ -133,7 +135,7 @@ class Monitor:
             f = self._simulate_reference(u) if inputs is None else inputs
             self.calibration = self._simulated(f, effect, arl0, samples=samples, extrapolate=extrapolate)
             if healthy is not None:
-                self.calibration = raise_thresholds(self, healthy, self.calibration)
+                self.calibration = raise_thresholds(self.calibration, found.model, healthy, self.watched)
         self._use(self.calibration)
         if isinstance(x0, str) and x0 == "unknown":
             self.plant.lose()
@@ -144,12 +146,12 @@ class Monitor:
              levels: Array | None = None) -> None:
         """Set up everything but the thresholds."""
         self.dictionary, self.window, self.seed, self.source = found, window, seed, None
-        chosen = searched([c for c in found.candidates if c.kind in COURSES and (c.kind != "loss" or c.columns)])
+        chosen = searched([c for c in found.candidates if c.additive or c.columns])
         if not chosen:
             raise StructureError("No candidate has a signature that a monitor can search for: add the kind 'bias'.")
         self.labels = tuple(c.label for c in chosen)
         self.skipped = {
-            c.label: "it is detected from the readings in any case" if c.kind in ("frozen", "noise") else
+            c.label: "it is detected from the readings in any case" if c.fault_kind.waveform or c.fault_kind.noise else
             "it has no signature that a running search can search for"
             for c in found.candidates if c.label not in self.labels
         }
@@ -423,9 +425,7 @@ class Monitor:
 
     def save(self, path: str | Path) -> Path:
         """Write the state and the thresholds to an npz file, from which `load` continues bit for bit."""
-        from optid.faults.monitor.file import save
-
-        return save(self, path)
+        return file.save(self, path)
 
     @classmethod
     def load(cls, path: str | Path, functions: dict[str, Any] | None = None) -> "Monitor":
@@ -438,8 +438,6 @@ class Monitor:
         Raises:
             ModelFileError: truncated, of another version, or not the state of a monitor.
         """
-        from optid.faults.monitor.file import load
-
         monitor = cls.__new__(cls)
-        load(monitor, path, functions)
+        file.load(monitor, path, functions)
         return monitor

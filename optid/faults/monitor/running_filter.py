@@ -20,8 +20,8 @@ from scipy.linalg import solve_triangular
 
 from optid.arrays import Array, compact
 from optid.faults.kernels import add_product, predict
+from optid.faults.kinds import DRIFT, JUMP
 from optid.faults.monitor.columns import SPARE, Columns, Matrices, Window
-from optid.faults.monitor.search_kernel import DRIFT, JUMP
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
 

@@ -10,11 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from optid.arrays import Array
+from optid.faults.kinds import DRIFT, DRIVEN, JUMP
 from optid.kernel_cache import cached_njit
 from optid.models.state_kernels import value_and_slope
-
-LASTING, DRIFT, JUMP, DRIVEN = range(4)
-"""The course of a column after its onset: 1 1 1 .., 1 2 3 .., 1 0 0 .., or given by the signals of the plant."""
 
 DEPENDENT = 1e-9
 """A column with less than this share of its energy beside the columns before it counts as dependent."""

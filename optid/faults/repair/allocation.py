@@ -178,7 +178,7 @@ class Allocation:
         from optid.solving.solve import solve
 
         program, solver = as_program(posed.beginning(start)), self.solver
-        if isinstance(solver, str) and solver != "auto" and program.kind == "NLP" and find(solver).refuses(program):
+        if isinstance(solver, str) and solver != "auto" and self.route == "nlp" and find(solver).refuses(program):
             solver = "auto"
         solution = solve(program, solver)
         if not solution.has_point or solution.status.value not in ("optimal", "locally optimal", "inaccurate"):

@@ -20,7 +20,7 @@ from optid.faults.repair.damage import Damage, damages
 from optid.faults.whitening import predictor
 
 if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import Answer
+    from optid.faults.diagnosis.answers import FaultAnswer
     from optid.models import HammersteinSS
 
 APART = 4.0
@@ -74,7 +74,8 @@ class Ambiguity:
 
 
 def probe_input(
-    model: Any, members: Sequence["Damage | Answer"], *, length: int = 20, hold: int = 5, low: ArrayLike | None = None,
+    model: Any, members: Sequence["Damage | FaultAnswer"], *, length: int = 20, hold: int = 5,
+    low: ArrayLike | None = None,
     high: ArrayLike | None = None, seed: int = 0,
 ) -> Probe:
     """Return the input that maximises the smallest distance between several explanations.

@@ -9,12 +9,12 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.bases import Triangular
-from optid.faults.faults import channel_of
+from optid.faults.places import channel_of
 from optid.faults.signatures import Candidate
 from optid.models.nonlinearity import Nonlinearity
 
 if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import Answer, Estimate
+    from optid.faults.diagnosis.answers import Estimate, FaultAnswer
     from optid.models import HammersteinSS
 
 DEAD_SHARE = 0.8
@@ -76,7 +76,7 @@ class Damage:
         )
 
 
-def damages(model: "HammersteinSS", answer: "Answer") -> list[Damage]:
+def damages(model: "HammersteinSS", answer: "FaultAnswer") -> list[Damage]:
     """Return one explanation of an answer, or one for each part of a group that is not isolable."""
     parts = [[(place, fault) for place in fault.candidate.places or (fault.name,)] for fault in answer.faults]
     variants = list(product(*parts))
@@ -85,7 +85,7 @@ def damages(model: "HammersteinSS", answer: "Answer") -> list[Damage]:
 
 def _may_be_none(fault: "Estimate") -> bool:
     """Whether no interval of the size of a fault that changes the plant excludes zero."""
-    lasting = fault.kind in ("bias", "drift", "loss", "stuck") and not fault.name.startswith("sensor:")
+    lasting = fault.candidate.fault_kind.lasting and not fault.name.startswith("sensor:")
     intervals = np.asarray(fault.size_interval, dtype=float)
     return lasting and intervals.size > 0 and bool(np.all((intervals[:, 0] <= 0) & (intervals[:, 1] >= 0)))
 
@@ -131,48 +131,48 @@ def _damage(model: "HammersteinSS", parts: Sequence[tuple[str, "Estimate"]], pos
         part, _, channel = place.partition(":")
         size = np.asarray(fault.size, dtype=float)
         known = bool(np.all(np.isfinite(size)))
-        into_state = fault.candidate.into_state
+        into_state, kind = fault.candidate.into_state, fault.candidate.fault_kind
         if known and _may_be_none(fault):
             notes.append(f"{place}: the interval of its size contains none: the plant stays as it was")
-        elif fault.kind == "spike":
+        elif kind.outlier:
             notes.append(f"{channel}: single readings were wrong; no part is broken")
         elif part == "actuator":
             mine = [i for i, of in enumerate(model.input_of) if of == channel_of(model.inputs, place)]
             found["columns"] += mine
-            if fault.kind == "drift":
-                notes.append(f"{channel}: a drift goes on growing; the model holds the mean since its onset")
-            if known and fault.kind in ("bias", "drift"):
+            if kind.grows:
+                notes.append(f"{channel}: a {kind.name} goes on growing; the model holds the mean since its onset")
+            if known and kind.additive:
                 constants[mine] += size
             elif known:
-                gains[mine] = float(np.clip(1 - size[0], 0.0, 1.0))
+                gains[mine] = kind.remaining(size)
                 if len(size) == 1 + len(mine):
                     constants[mine] += size[1:]
                 low, high = np.asarray(fault.size_interval, dtype=float)[0]
-                if size[0] >= DEAD_SHARE and low <= 1 <= high or fault.kind == "frozen":
+                if kind.loses and size[0] >= DEAD_SHARE and low <= 1 <= high:
                     found["dead"] += mine
                     gains[mine] = 0.0
                     notes.append(f"{channel}: the interval of the share lost includes a total loss: hard-over")
         elif part == "sensor":
             name = model.outputs[channel_of(model.outputs, place)]
-            if fault.kind == "noise" and known:
+            if kind.noise and known:
                 louder[name] = float(np.max(np.abs(size)))
             else:
                 found["sensors"].append(name)
-                if fault.kind == "bias" and known:
+                if kind.additive and not kind.grows and known:
                     notes.append(f"{channel}: its readings were off by {size[0]:.4g}; they are not used")
-        elif fault.kind == "noise":
+        elif kind.noise:
             states = states + into_state * size**2 @ into_state.T if known else states
-        elif fault.kind == "jump":
+        elif kind.additive and not kind.lasting:
             notes.append("the state jumped once: the plant is unchanged, the observer restarts")
         else:
             found["offsets"].append(replace(fault.candidate, kind=fault.kind, name=place,
                                             members=fault.candidate.members or (place,)))
-            if fault.kind == "drift":
-                notes.append(f"{place}: a drift goes on growing; the model holds its last value")
+            if kind.grows:
+                notes.append(f"{place}: a {kind.name} goes on growing; the model holds its last value")
             elif known:
                 added = added + into_state @ size
     onsets = [fault.onset for _, fault in parts]
-    label = " + ".join(place if fault.kind in ("bias", "jump") else f"{place} {fault.kind}" for place, fault in parts)
+    label = " + ".join(fault.candidate.fault_kind.own_label(place) for place, fault in parts)
     once: dict[str, Any] = {name: tuple(dict.fromkeys(values)) for name, values in found.items() if name != "offsets"}
     return Damage(label, posterior, max(onsets), min(onsets) == max(onsets), offsets=tuple(found["offsets"]),
                   louder_sensors=louder, louder_states=states, gains=gains, constants=constants, added=added, **once)

@@ -19,7 +19,7 @@ from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.faults.repair.curves import Curve, curve_of
 from optid.faults.repair.damage import Damage
-from optid.faults.signatures import Candidate, course_of
+from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor, predictor, whiten
 from optid.models.experiments import in_units_of
 from optid.models.nonlinearity import Nonlinearity
@@ -37,7 +37,7 @@ MATRICES = ("A", "B", "C", "D")
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class RefitPrior:
     """Prior of a refit: the plant is as it was, except for what broke.
 
     Attributes:
@@ -62,7 +62,7 @@ class Prior:
                 raise StructureError(f"prior: {word} = {getattr(self, word)!r} must be a positive number.")
 
 
-class Window(NamedTuple):
+class RefitWindow(NamedTuple):
     """A record from the sample before the fault on, or from the fault on where no earlier sample is usable."""
 
     u: Array  # (N, m) inputs
@@ -85,11 +85,11 @@ class Refitting:
 
     model: "HammersteinSS"  # the healthy model
     steady: Predictor  # its predictor; its gain is kept
-    windows: tuple[Window, ...]  # one per experiment
+    windows: tuple[RefitWindow, ...]  # one per experiment
     curves: tuple[Curve, ...]  # the damaged nonlinearities
     offsets: tuple[Candidate, ...]  # faults that add a constant or a drift, whose size is estimated as well
     whole: bool  # whether the matrices and the other nonlinearities are open, too
-    prior: Prior
+    prior: RefitPrior
 
     @cached_property
     def unknowns(self) -> dict[str, Array]:
@@ -264,21 +264,21 @@ class Refitting:
         white: Any = steady.whitened(innovations, shown)
         return white[shown], -response[shown]
 
-    def _signals(self, theta: Array, w: Window, states: Array) -> tuple[Array, Array]:
+    def _signals(self, theta: Array, w: RefitWindow, states: Array) -> tuple[Array, Array]:
         """Return the next states (N, n) and the outputs (N, l) of the model along states (N, n)."""
         model, values = self.model_at(theta), self.unpack(theta)
         f = model.expanded(w.u)
         later = states @ model.A.T + f @ model.B.T + model.offset_x + w.fed
         outputs = states @ model.C.T + f @ model.D.T + model.offset_y
         for c in self.offsets:
-            course, size = course_of(c.kind, w.since), values[f"size[{c.label}]"]
+            course, size = c.fault_kind.progress(w.since), values[f"size[{c.label}]"]
             later[:-1] += np.outer(course[1:], c.into_state @ size)
             outputs += np.outer(course, c.into_output @ size)
         return later, outputs
 
 
 def refitting(
-    model: "HammersteinSS", data: Data, damage: Damage, *, whole: bool = False, prior: Prior | None = None,
+    model: "HammersteinSS", data: Data, damage: Damage, *, whole: bool = False, prior: RefitPrior | None = None,
     nodes: int = NODES,
 ) -> Refitting:
     """Prepare a refit from the record after a fault.
@@ -291,7 +291,7 @@ def refitting(
         data: the record; the fault is in the first experiment from its onset on and in all of the others.
         damage: what broke, and when.
         whole: open the matrices and the other nonlinearities, too.
-        prior: see `Prior`.
+        prior: see `RefitPrior`.
         nodes: values of a damaged nonlinearity, where it has no nodes of its own.
 
     Raises:
@@ -307,7 +307,7 @@ def refitting(
                     for number, part in enumerate(raw.experiments))
     inputs = np.vstack([w.u[int(w.held) :] for w in windows])
     curves = tuple(curve_of(model, i, inputs, raw, nodes, i in damage.dead) for i in damage.columns)
-    found = Refitting(model, steady, windows, curves, damage.offsets, whole, prior or Prior())
+    found = Refitting(model, steady, windows, curves, damage.offsets, whole, prior or RefitPrior())
     needed = sum(curve.values_open for curve in curves) + sum(c.into_state.shape[1] for c in damage.offsets)
     if found.readings < needed:
         raise RankError(
@@ -316,7 +316,7 @@ def refitting(
     return found
 
 
-def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: int, known_start: bool) -> Window:
+def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: int, known_start: bool) -> RefitWindow:
     """Cut a record at the onset of a fault; the state there is predicted from the samples before."""
     if onset >= len(y):
         raise DataError(f"The onset {onset} lies beyond the record of {len(y)} samples.")
@@ -344,4 +344,4 @@ def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: i
         white = whiten(model, part, scale=steady)
         x0, e0 = white.states[-1], np.nan_to_num(white.innovations[-1])
     after = slice(start if held else onset, None)
-    return Window(u[after], y[after], ~np.isnan(y[after]), fed[after], x0, e0, held)
+    return RefitWindow(u[after], y[after], ~np.isnan(y[after]), fed[after], x0, e0, held)

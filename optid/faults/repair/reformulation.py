@@ -3,7 +3,6 @@
 Everything here is a pure function of a healthy model and a diagnosis; the healthy model is never changed.
 """
 
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -18,24 +17,14 @@ from optid.faults.diagnosis.records import record_of
 from optid.faults.repair.allocation import Allocation, Target, allocate, robust_allocation
 from optid.faults.repair.ambiguity import Ambiguity, advise
 from optid.faults.repair.damage import Damage, damages, merged
-from optid.faults.repair.refitting import NODES, Prior
+from optid.faults.repair.refitting import NODES, RefitPrior
 from optid.faults.repair.schedule import Schedule, refit
 from optid.faults.repair.virtual_sensor import Observer, observer, without_sensors
+from optid.registry import Rendered
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from optid.faults.diagnosis.answers import Diagnosis
     from optid.models import HammersteinSS
-
-HEADS = {
-    "healthy": "healthy: the plant is as it was",
-    "refitted": "one explanation; the model is refitted",
-    "as diagnosed": "one explanation; the model is that of the diagnosis",
-    "not repaired": "one explanation; its refit is not offered, and the model stays the healthy one",
-    "ambiguous": "several explanations; the model stays the healthy one until one is left",
-}
-"""The statuses in words."""
 
 WITHOUT_ANSWER = {
     "unknown": "no fault of the dictionary fits, so that no part of the model can be changed. Add candidates to the "
@@ -70,8 +59,8 @@ class MemberModel:
         return "\n".join([*map(str, parts), *(f"note: {note}" for note in self.notes)])
 
 
-@dataclass(frozen=True, eq=False)
-class Reformulation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Reformulation(Rendered):
     """The damaged system; `print` it, or ask `attainable`.
 
     Attributes:
@@ -117,27 +106,12 @@ class Reformulation:
             raise StructureError(f"The attainable outputs are unknown: {'; '.join(self.notes) or 'no allocation'}.")
         return self.allocation.attainable(reference)
 
-    def plot(self) -> "Figure":
-        """Draw the nonlinearities before and after, the attainable outputs, and the errors of the outputs."""
-        from optid.faults.repair.picture import draw
-
-        return draw(self)
-
-    def __str__(self) -> str:
-        """Return the result in 80 columns."""
-        told = (self.schedule, self.if_ambiguous, *((self.observer, self.allocation) if self.members else ()))
-        heads = [f"{one.label} (probability {one.damage.posterior:.3g})" for one in self.members]
-        text = "\n".join([HEADS[self.status], *heads, *(str(one) for one in told if one is not None)])
-        known = {line.strip() for line in text.splitlines()}
-        lines = text.splitlines() + [f"note: {note}" for note in self.notes if note.strip() not in known]
-        return "\n".join(
-            textwrap.fill(line, 80, subsequent_indent=" " * (len(line) - len(line.lstrip()) + 4),
-                          break_long_words=False, break_on_hyphens=False) for line in lines)
 
 
 def reformulate(
     model: "HammersteinSS", diagnosis: "Diagnosis", data: Any = None, *,
-    constraints: Sequence[Any] | str = "default", prior: Prior | None = None, nodes: int = NODES, stage: str = "auto",
+    constraints: Sequence[Any] | str = "default", prior: RefitPrior | None = None, nodes: int = NODES,
+    stage: str = "auto",
     low: ArrayLike | None = None, high: ArrayLike | None = None, weights: ArrayLike | None = None,
     route: str = "auto", if_ambiguous: str = "auto", solver: Any = "auto", seed: int = 0, healthy: Any = None,
 ) -> Reformulation:

@@ -13,7 +13,7 @@ from optid.errors import DataWarning, RankError
 from optid.faults.repair.curves import Curve
 from optid.faults.repair.damage import Damage
 from optid.faults.repair.promise import CONFIDENCE, Promise, errors, rms, upper_rms
-from optid.faults.repair.refitting import NODES, Prior, Refitting, refitting
+from optid.faults.repair.refitting import NODES, RefitPrior, Refitting, refitting
 from optid.models.experiments import in_units_of
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Schedule:
 
 def refit(
     model: "HammersteinSS", data: Data, damage: Damage, *, constraints: Sequence[Any] | str = "default",
-    prior: Prior | None = None, nodes: int = NODES, stage: str = "auto", solver: Any = "auto", seed: int = 0,
+    prior: RefitPrior | None = None, nodes: int = NODES, stage: str = "auto", solver: Any = "auto", seed: int = 0,
     healthy: Data | None = None,
 ) -> tuple["HammersteinSS", Schedule]:
     """Refit what a fault broke, or all parameters where that predicts held-out samples better.
@@ -154,7 +154,7 @@ def _plant(problem: Refitting, theta: Array) -> "HammersteinSS":
     """Return the model of a refit, with what the faults add at the end of the record."""
     model = problem.model_at(theta)
     for c in problem.offsets:
-        last = 1.0 if c.kind != "drift" else float(len(problem.windows[0].u) - int(problem.windows[0].held))
+        last = float(c.fault_kind.progress(problem.windows[0].since)[-1])
         size = problem.unpack(theta)[f"size[{c.label}]"]
         model = replace(model, offset_x=model.offset_x + c.into_state @ (last * size))
     return model

@@ -15,7 +15,7 @@ import numpy as np
 from optid.arrays import Array, one_or_all
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
-from optid.faults.faults import channel_of
+from optid.faults.places import channel_of
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
 

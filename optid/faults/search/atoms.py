@@ -63,7 +63,7 @@ def atoms_of(found: Scan, limits: "Thresholds", onsets: np.ndarray | None = None
     Raises:
         StructureError: thresholds of other candidates or missing for one that is tested; a window that is too long.
     """
-    q = limits.for_scan(found)
+    q = limits.of(found.labels, found.tested_anywhere)
     wanted = np.ones(found.statistic.shape[1], dtype=bool) if onsets is None else onsets
     places = [np.flatnonzero(~np.isnan(row) & wanted) for row in found.statistic]
     columns = sum(where.size * c.dimension for where, c in zip(places, found.dictionary.candidates))

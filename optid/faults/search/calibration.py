@@ -1,7 +1,6 @@
 """Thresholds of the search for a fault for a given false-alarm probability of a healthy window."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,9 +11,6 @@ from optid.faults.search.sweeps import sweep
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened
 from optid.models.experiments import samples_of
-
-if TYPE_CHECKING:
-    from optid.faults.search.scanning import Scan
 
 EXCEEDING = 50
 """Least number of simulated windows that exceed the thresholds."""
@@ -43,26 +39,26 @@ class Thresholds:
     draws: int
     seed: int | None
 
-    def of(self, labels: tuple[str, ...]) -> Array:
+    def of(self, labels: tuple[str, ...], tested: np.ndarray | None = None) -> Array:
         """Return the thresholds (C,) of candidates.
 
+        Args:
+            labels: of the candidates.
+            tested: (C,) which of them a search tests; none by default.
+
         Raises:
-            StructureError: other candidates than these.
+            StructureError: other candidates than these, no threshold for a tested one.
         """
         if labels != self.labels:
             raise StructureError(
                 f"These thresholds are of other candidates ({', '.join(self.labels)}): calibrate them again."
             )
-        return self.q
-
-    def for_scan(self, found: "Scan") -> Array:
-        """Return the thresholds (C,) of a search; StructureError where one is missing for a tested candidate."""
-        q, tested = self.of(found.labels), [bool(np.isfinite(row).any()) for row in found.statistic]
-        missing = [label for label, value, used in zip(self.labels, q, tested) if used and not value > 0]
+        used = np.zeros(len(labels), dtype=bool) if tested is None else tested
+        missing = [label for label, value, here in zip(self.labels, self.q, used) if here and not value > 0]
         if missing:
             raise StructureError(
                 f"There is no threshold for {', '.join(missing)}: calibrate with the inputs, thresholds(..., u=u).")
-        return q
+        return self.q
 
     def __str__(self) -> str:
         """Print the thresholds."""

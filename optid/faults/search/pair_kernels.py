@@ -76,7 +76,7 @@ def search(tables, grams, tested, z, q, same, floor):
     """Find the best pair of onsets for every pair of candidates.
 
     Args:
-        tables: `optid.faults.search.sweeps.Tables`.
+        tables: `optid.faults.search.sweeps.SweepTables`.
         grams: `Grams`.
         tested: (C, N) which onsets count.
         z: (N, D) coordinates of the window along the axes of every candidate.

@@ -2,21 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import LookupFailed, StructureError, nearest
+from optid.faults.search.calibration import Thresholds
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
-from optid.show.wording import short
-
-if TYPE_CHECKING:
-    from optid.faults.search.calibration import Thresholds
-
+from optid.phrases import short
 
 ALIKE = 2e-6
 """One less the squared cosine of two signatures below which they are indistinguishable."""
@@ -59,6 +56,16 @@ class Scan:
     def labels(self) -> tuple[str, ...]:
         """Labels of the candidates."""
         return self.dictionary.labels
+
+    @property
+    def tested(self) -> np.ndarray:
+        """(C, N) whether a candidate is tested at an onset."""
+        return np.asarray(~np.isnan(self.statistic))
+
+    @property
+    def tested_anywhere(self) -> np.ndarray:
+        """(C,) whether a candidate is tested at some onset."""
+        return np.asarray(self.tested.any(axis=1))
 
     @property
     def energy(self) -> float:
@@ -125,7 +132,7 @@ class Scan:
         inverse /= np.outer(sizes, sizes)
         return Magnitude(inverse @ (flat.T @ self.whitened.r.ravel()), inverse)
 
-    def gains(self, thresholds: "Thresholds") -> Array:
+    def gains(self, thresholds: Thresholds) -> Array:
         """Return the statistics less their thresholds, (C, N): the fault at the largest is the exact optimum.
 
         Raises:

@@ -149,7 +149,8 @@ def pairs(scan: Scan, thresholds: "Thresholds", *, same: bool = True) -> SubsetS
     from optid.faults.search.pair_kernels import Grams, search
     from optid.faults.search.sweep_kernels import grams
 
-    q, prepared, tested = thresholds.for_scan(scan), scan.sweep, ~np.isnan(scan.statistic)
+    prepared, tested = scan.sweep, scan.tested
+    q = thresholds.of(scan.labels, scan.tested_anywhere)
     number = int(tested.sum())
     if number > MOST_PAIRED:
         raise StructureError(

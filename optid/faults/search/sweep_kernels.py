@@ -73,7 +73,7 @@ def grams(tables, slots, products, states):
     """Products of the signatures of columns with the same onset, for all onsets, by one backward sweep.
 
     Args:
-        tables: `optid.faults.search.sweeps.Tables`.
+        tables: `optid.faults.search.sweeps.SweepTables`.
         slots: (D, D) where in a row of products that of two columns is written, -1 for nowhere; those of columns of
             different candidates are computed only with states.
         products: (N, R) written.

@@ -19,7 +19,8 @@ import numpy as np
 
 from optid.arrays import Array, compact
 from optid.errors import DataError, StructureError
-from optid.faults.faults import matrices_of
+from optid.faults.kinds import DRIFT, JUMP
+from optid.faults.places import matrices_of
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened
 from optid.models.experiments import samples_of
@@ -33,11 +34,8 @@ BATCH = 2_000_000
 SMALL = 10_000
 """Products of columns up to which a single run takes less time than to compile it."""
 
-ORDERS = {"drift": 1, "jump": 2, "spike": 2}
-"""Where the columns of a kind stand: those that last, drifts, jumps."""
 
-
-class Tables(NamedTuple):
+class SweepTables(NamedTuple):
     """Input of the kernels of `optid.faults.search.sweep_kernels`.
 
     Attributes:
@@ -89,7 +87,7 @@ class Sweep:
     found: Dictionary
     white: Whitened
     u: Array | None
-    tables: Tables
+    tables: SweepTables
     roots: Array
     tested: np.ndarray
     along: Array
@@ -276,16 +274,16 @@ def inverse_roots(products: Array, largest: Array, share: float = SHARE) -> Arra
     return np.asarray(inverse[:, :, None] * np.swapaxes(axes, 1, 2))
 
 
-def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[bool, ...]) -> Tables:
+def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[bool, ...]) -> SweepTables:
     steady, window, l = white.predictor, len(white.r), found.model.l  # noqa: E741
     patterns, which = np.unique(white.present, axis=0, return_inverse=True)
     of = np.asarray(which, dtype=np.int64).ravel()
     gains = np.where(patterns[:, None, :], -steady.K, steady.L)
     whitening = np.stack([steady.whitened(np.eye(l)[None], pattern[None])[0] for pattern in patterns])
     candidates = found.candidates
-    lasting, drifts, jumps = (
-        [i for i, a in enumerate(able) if a and ORDERS.get(candidates[i].kind, 0) == order] for order in range(3)
-    )
+    tested = [i for i, a in enumerate(able) if a]
+    drifts, jumps = ([i for i in tested if candidates[i].fault_kind.course == course] for course in (DRIFT, JUMP))
+    lasting = [i for i in tested if i not in drifts and i not in jumps]
     line = lasting + drifts + drifts + jumps  # the helpers of the drifts are the last of the columns that last
     into = [
         found.additions(c, window, 0, u) if c.columns else (c.into_state[None], c.into_output[None])
@@ -304,13 +302,13 @@ def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[boo
         first[i], dimensions[i] = begin, d
     places = np.concatenate([[0], np.cumsum(dimensions**2)[:-1]])
     helpers, drifting = (sum(candidates[i].dimension for i in part) for part in (lasting, drifts))
-    return Tables(
+    return SweepTables(
         of, compact(steady.A + gains @ steady.C), compact(steady.C), compact(whitening), compact(h), compact(e),
         helpers + drifting, drifting, helpers, np.repeat(line, sizes), first, dimensions, places,
     )
 
 
-def _with_schedules(found: Dictionary, white: Whitened, tables: Tables, u: Array | None) -> Tables:
+def _with_schedules(found: Dictionary, white: Whitened, tables: SweepTables, u: Array | None) -> SweepTables:
     """Append the states of one more predictor for every scheduled change: it has matrices of its own."""
     steady, n = white.predictor, found.model.nx
     chosen = [(i, c) for i, c in enumerate(found.candidates) if c.schedule is not None and tables.sizes[i]]

@@ -14,7 +14,7 @@ import numpy as np
 from optid.arrays import LARGEST, is_number, shown
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.search.trial import Candidate
+from optid.identify.search.trial import StructureCandidate
 
 EFFORTS = {"small": 15.0, "normal": 60.0, "large": 400.0}
 """Units of a search, by word."""
@@ -37,7 +37,7 @@ def effort_of(given: Any) -> float:
     return float(value)
 
 
-def units(candidate: Candidate, data: Data, fits: int = 1, searches: int = 1) -> float:
+def units(candidate: StructureCandidate, data: Data, fits: int = 1, searches: int = 1) -> float:
     """Return what so many fits of a candidate to a record, or to the rest of it without a block, cost.
 
     Of functions of latent signals, so many fits search for them; the others go on from a model with them.

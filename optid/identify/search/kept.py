@@ -11,7 +11,7 @@ import numpy as np
 
 from optid.data.record import Data
 from optid.errors import DataError
-from optid.identify.search.trial import OUT_OF_TIME, Candidate, Trial
+from optid.identify.search.trial import OUT_OF_TIME, StructureCandidate, Trial
 from optid.models.files import read, write
 
 FORMAT, VERSION = "optid search", 1
@@ -41,7 +41,7 @@ class KeptTrials:
                             "another file")
         self._known = dict(trials)
 
-    def known(self, candidate: Candidate, rival: Trial | None) -> Trial | None:
+    def known(self, candidate: StructureCandidate, rival: Trial | None) -> Trial | None:
         """Return the trial of a candidate against a rival, if it was finished; it takes no more time."""
         found = self._known.get(_key(candidate, rival))
         return None if found is None else replace(found, candidate=candidate, seconds=0.0)
@@ -62,7 +62,7 @@ def _fingerprint(data: Data, settings: Mapping[str, Any]) -> str:
     return found.hexdigest()
 
 
-def _key(candidate: Candidate, rival: Trial | None) -> str:
+def _key(candidate: StructureCandidate, rival: Trial | None) -> str:
     parts = [candidate] if rival is None else [candidate, rival.candidate]
     return json.dumps([[one.formulation, one.arguments] for one in parts], sort_keys=True, default=str)
 
@@ -77,7 +77,7 @@ def _row(one: Trial) -> dict[str, Any]:
 
 def _trial(row: dict[str, Any]) -> Trial:
     row = {name: value for name, value in row.items() if name != "key"}
-    candidate = Candidate(row.pop("kind"), row.pop("formulation"), row.pop("arguments"))
+    candidate = StructureCandidate(row.pop("kind"), row.pop("formulation"), row.pop("arguments"))
     width = len(row["energy"][0]) if row["energy"] else 1
     arrays = {name: np.asarray(row.pop(name), dtype=float).reshape(-1, width) for name in ARRAYS}
     return Trial(candidate, **{**row, **arrays, "estimation": float(row["estimation"]), "order": tuple(row["order"])})

@@ -19,9 +19,9 @@ from optid.identify.informativity import Informativity, Process, informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.levels import LevelEvidence, level_evidence
 from optid.identify.search.determined import determined_bases
-from optid.identify.search.trial import CLEAR, FEEDBACK, INPUTS, KINDS, LATENT, LINEAR, Candidate, Trial, near
+from optid.identify.search.trial import CLEAR, FEEDBACK, INPUTS, KINDS, LATENT, LINEAR, StructureCandidate, Trial, near
 
-Rung = Generator[list[Candidate], list[Trial], None]
+Rung = Generator[list[StructureCandidate], list[Trial], None]
 
 ONE_LEVEL = ("hammerstein_ss.sid",)  # formulations with one constant for all experiments, beside feedback and latent
 PATIENCE = 2  # successive orders without improvement after which a rung ends
@@ -73,7 +73,7 @@ class Ladder:
         return cls(data, len(blocks.moving), told, delays, regressions, {},
                    _levels_of(data, delays[-1]) if several else None)
 
-    def levelled(self, candidate: Candidate) -> Candidate:
+    def levelled(self, candidate: StructureCandidate) -> StructureCandidate:
         """Return a candidate with a level for every experiment, where the record has them and the method knows them."""
         if not self.levels_differ or candidate.kind in (FEEDBACK, LATENT) or candidate.formulation in ONE_LEVEL:
             return candidate
@@ -155,7 +155,7 @@ class Ladder:
                    default=2)
 
 
-def climbed(candidates: Iterable[list[Candidate]]) -> Rung:
+def climbed(candidates: Iterable[list[StructureCandidate]]) -> Rung:
     """Try one batch after another until two in a row bring no improvement: of the score, or without one of the fit."""
     best, failed = (False, -np.inf), 0
     for batch in candidates:
@@ -201,7 +201,7 @@ def linear_models(ladder: Ladder) -> Rung:
                for n in dict.fromkeys([max(a["na"] - 1, 1), a["na"], a["na"] + 1])]
 
 
-def process_models(ladder: Ladder) -> Iterator[Candidate]:
+def process_models(ladder: Ladder) -> Iterator[StructureCandidate]:
     """Yield processes in continuous time with as many poles as were found, and with one less or more."""
     responses = ladder.told.processes[0].responses
     if any(r.nodes is not None for r in responses):  # a bent f is a matter of richer classes
@@ -216,7 +216,7 @@ def process_models(ladder: Ladder) -> Iterator[Candidate]:
         yield structure(LINEAR, "process.exact", process=words, initial="free")
 
 
-def low_order(ladder: Ladder) -> Iterator[Candidate]:
+def low_order(ladder: Ladder) -> Iterator[StructureCandidate]:
     """Yield the model of the dead times and poles that were found in a record of one output."""
     process = ladder.told.processes[0]
     orders = _orders(process)
@@ -261,7 +261,7 @@ def input_functions(ladder: Ladder) -> Rung:
         yield [structure(INPUTS, "hammerstein_bj.exact", **a, basis=word) for word in words]
         return
 
-    def model(n: int, nk: Sequence[int], basis: Any) -> Candidate:
+    def model(n: int, nk: Sequence[int], basis: Any) -> StructureCandidate:
         return structure(INPUTS, "hammerstein_oe.exact", na=n, nb=n, nk=list(nk), basis=basis)
 
     for one in ladder.told.processes[:1]:
@@ -326,7 +326,7 @@ def latent_signals(ladder: Ladder) -> Rung:
 
     Signals are added while the fit to the record rises; other families of functions are tried where the first help.
     """
-    def model(n: int, channels: int, latent_basis: str, direct: bool, basis: Any = "linear") -> Candidate:
+    def model(n: int, channels: int, latent_basis: str, direct: bool, basis: Any = "linear") -> StructureCandidate:
         inner = {} if basis == "linear" else {"basis": basis}
         return structure(LATENT, "lfr.exact", nx=n, channels=channels, latent_basis=latent_basis, direct=direct,
                          **inner)
@@ -359,7 +359,7 @@ def latent_signals(ladder: Ladder) -> Rung:
         yield [structure(LATENT, "lfr.exact", **ladder.arguments(LATENT, "lfr.exact"), tries=2)]
 
 
-def _larger(ladder: Ladder, model: Callable[..., Candidate]) -> Rung:
+def _larger(ladder: Ladder, model: Callable[..., StructureCandidate]) -> Rung:
     """One more state, or one more latent signal, whatever the record is followed better with, while it is by much."""
     leading = ladder.leading(LATENT, "lfr.exact")
     while leading is not None:
@@ -396,9 +396,9 @@ RUNGS: dict[str, Callable[[Ladder], Rung]] = {
     LINEAR: linear_models, INPUTS: input_functions, FEEDBACK: feedback, LATENT: latent_signals}
 
 
-def structure(kind: str, formulation: str, **arguments: Any) -> Candidate:
+def structure(kind: str, formulation: str, **arguments: Any) -> StructureCandidate:
     """Return a candidate of a class."""
-    return Candidate(kind, formulation, arguments)
+    return StructureCandidate(kind, formulation, arguments)
 
 
 def _levels_of(data: Data, nk: tuple[int, ...]) -> LevelEvidence | None:

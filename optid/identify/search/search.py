@@ -32,7 +32,7 @@ from optid.identify.search.trial import (
     LATENT,
     LINEAR,
     OUT_OF_TIME,
-    Candidate,
+    StructureCandidate,
     Trial,
     cheap_settings,
     continued,
@@ -46,7 +46,7 @@ from optid.registry import Rendered, read_constraints
 from optid.threads import one_thread
 
 BUDGET, INTERRUPT = "the budget", "an interrupt"
-Runs = Callable[[Sequence[Candidate], Trial | None], list[Trial | None]]
+Runs = Callable[[Sequence[StructureCandidate], Trial | None], list[Trial | None]]
 # samples of a long record on which structures are compared, and up to which a record is not long: stretches cut out of
 # it lose their beginnings, and with them more than a shorter trial saves
 COMPARED, LONG = 5_000, 8_000
@@ -240,8 +240,8 @@ def _climb(ladder: Ladder, kinds: Sequence[str], run: Runs, most: float, left: C
     """
     early = [kind for kind in (LINEAR, INPUTS) if kind in kinds and ladder.told.processes and ladder.single]
     rungs = {kind: RUNGS[kind](ladder) for kind in kinds}
-    batches: dict[str, list[Candidate]] = {}
-    waiting: dict[str, list[Candidate]] = {}  # of the batch of a class, those that are not tried yet
+    batches: dict[str, list[StructureCandidate]] = {}
+    waiting: dict[str, list[StructureCandidate]] = {}  # of the batch of a class, those that are not tried yet
     spent = ladder.spent
     while rungs:
         if not early and ladder.choice() is not None and sum(spent.values()) >= most:
@@ -276,12 +276,12 @@ def _share(ladder: Ladder, kind: str) -> float:
     return (MANY if kind == LATENT else 1.0) * (LEADING if leads else 1.0)
 
 
-def _different(ladder: Ladder, batch: Sequence[Candidate]) -> list[Candidate]:
+def _different(ladder: Ladder, batch: Sequence[StructureCandidate]) -> list[StructureCandidate]:
     """Return the candidates of a batch, each once."""
     return list({c.key: c for c in map(ladder.levelled, batch)}.values())
 
 
-def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], run: Runs, most: float) -> None:
+def _tried(ladder: Ladder, kind: str, batch: Sequence[StructureCandidate], run: Runs, most: float) -> None:
     """Try candidates of a class against its best so far, and put their trials down in the order of the batch."""
     rival, tasks = ladder.rival(kind), []
     for candidate in batch:
@@ -298,7 +298,7 @@ def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], run: Runs, mos
 
 
 def _run(pool: TrialPool, kept: KeptTrials, left: Callable[[], float], told: Callable[[Trial], None],
-         batch: Sequence[Candidate], rival: Trial | None) -> list[Trial | None]:
+         batch: Sequence[StructureCandidate], rival: Trial | None) -> list[Trial | None]:
     """Return the trials of candidates against a rival, kept ones or new; None where no time was left."""
     known = [kept.known(candidate, rival) for candidate in batch]
     new = pool.run([(candidate, rival) for candidate, trial in zip(batch, known) if trial is None], left, told)
@@ -309,7 +309,7 @@ def _run(pool: TrialPool, kept: KeptTrials, left: Callable[[], float], told: Cal
 
 @one_thread
 def _attempt(blocks: Blocks, settings: Mapping[str, Any], rules: Sequence[Any], horizon: int | None,
-             task: tuple[Candidate, Trial | None], seconds: float) -> Trial:
+             task: tuple[StructureCandidate, Trial | None], seconds: float) -> Trial:
     """Try a candidate against a rival, for so many CPU seconds at most."""
     candidate, rival = task
     return tried(candidate, blocks, rival, settings, rules, horizon, seconds)

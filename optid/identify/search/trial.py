@@ -42,7 +42,7 @@ Key = tuple[str, tuple[tuple[str, Any], ...]]
 
 
 @dataclass(frozen=True)
-class Candidate:
+class StructureCandidate:
     """A structure of a class of models, such as "linear": formulation and arguments for `optid.fit`."""
 
     kind: str
@@ -90,7 +90,7 @@ class Trial:
         reason: why it was dropped, "" where it was tried on every block.
     """
 
-    candidate: Candidate
+    candidate: StructureCandidate
     estimation: float = -np.inf
     energy: Array = field(default_factory=lambda: np.zeros((0, 1)), repr=False)
     measure: Array = field(default_factory=lambda: np.zeros((0, 1)), repr=False)
@@ -143,7 +143,7 @@ class Trial:
         return float(np.median(gains)) if gains.size else -np.inf
 
 
-def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: Mapping[str, Any],
+def tried(candidate: StructureCandidate, blocks: Blocks, rival: Trial | None, settings: Mapping[str, Any],
           constraints: Sequence[Any], horizon: int | None, seconds: float = np.inf) -> Trial:
     """Fit a candidate, cross-validate it block by block, and stop early where it cannot beat its rival.
 
@@ -174,7 +174,7 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
     return replace(found, fits=fits, searches=searches, seconds=time.process_time() - clock)
 
 
-def _bases(candidate: Candidate, data: Data) -> dict[str, Any]:
+def _bases(candidate: StructureCandidate, data: Data) -> dict[str, Any]:
     """Return the bases of a candidate on the ranges of the whole record, which a block left out may narrow."""
     found: dict[str, Any] = {}
     if "basis" in candidate.arguments:
@@ -228,12 +228,12 @@ def _steps(known: Trial, whole: Fit, fitted: Callable[..., Fit], blocks: Blocks,
     yield known
 
 
-def leaves(candidate: Candidate, model: Any, blocks: Blocks, horizon: int | None) -> bool:
+def leaves(candidate: StructureCandidate, model: Any, blocks: Blocks, horizon: int | None) -> bool:
     """Whether free runs of a model with functions of outputs or latent signals leave what these were fitted to."""
     return horizon is None and candidate.kind in (FEEDBACK, LATENT) and blocks.excursion(model) > AWAY
 
 
-def _no_better(candidate: Candidate, energies: Array, measures: Array, rival: Trial) -> str:
+def _no_better(candidate: StructureCandidate, energies: Array, measures: Array, rival: Trial) -> str:
     """Return why a model of the whole record, by its errors on the blocks (b, l), cannot replace a rival; "" if it can.
 
     The errors on a block are seldom smaller where the block is left out.
@@ -249,13 +249,13 @@ def _no_better(candidate: Candidate, energies: Array, measures: Array, rival: Tr
     return ""
 
 
-def continued(candidate: Candidate, fitted: Callable[..., Fit], data: Data, model: Any) -> Fit:
+def continued(candidate: StructureCandidate, fitted: Callable[..., Fit], data: Data, model: Any) -> Fit:
     """Return the fit of a candidate that goes on from a model of the same structure."""
     return fitted(data, initial=model, **CONTINUED.get(candidate.formulation, {}))
 
 
-def _left_out(candidate: Candidate, fitted: Callable[..., Fit], blocks: Blocks, block: int, horizon: int | None,
-              whole: Any, reached: Array) -> tuple[Fit, bool]:
+def _left_out(candidate: StructureCandidate, fitted: Callable[..., Fit], blocks: Blocks, block: int,
+              horizon: int | None, whole: Any, reached: Array) -> tuple[Fit, bool]:
     """Return the fit to all other blocks, which descends from the model of the whole record.
 
     Functions of latent signals have many optima: where the block is much worse than in the fit to the whole record,
@@ -289,7 +289,7 @@ def near(score: float) -> float:
     return max(EQUAL * (100 - score), min(SMALL, SMALLER * (100 - score)))
 
 
-def cheap_settings(candidate: Candidate) -> dict[str, Any]:
+def cheap_settings(candidate: StructureCandidate) -> dict[str, Any]:
     """Return the arguments that make a trial faster than the final fit."""
     if candidate.formulation.endswith("oe.exact"):
         return {"starts": STARTS}

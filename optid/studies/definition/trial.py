@@ -10,10 +10,10 @@ import numpy as np
 from optid.core.program import Program, programme_of
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
+from optid.phrases import short
 from optid.program.solution import Status
 from optid.registry import formulation as look_up
 from optid.registry import named_constraint
-from optid.show.wording import short
 from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.definition.problems import Label, Problems

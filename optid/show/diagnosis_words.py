@@ -1,23 +1,15 @@
 """Texts of a diagnosis."""
 
 import textwrap
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optid.data.description import listed_findings
+from optid.faults.diagnosis.answers import Diagnosis, Estimate
+from optid.faults.kinds import kind_of
 from optid.phrases import p_value
 
-if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import Diagnosis, Estimate
-
 WIDTH = 80
-
-WORDS = {
-    "drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading", "saturated": "reading",
-    "schedule": "share of the change",
-}
-"""Name of the magnitude of a kind."""
 
 HEADLINES = {
     "healthy": "no alarm",
@@ -28,7 +20,7 @@ HEADLINES = {
 """Headline of a verdict without an answer."""
 
 
-def estimate_line(fault: "Estimate") -> str:
+def estimate_line(fault: Estimate) -> str:
     """State the label of a fault, its onset and size."""
     lines = [onset_words(fault), *size_words(fault)]
     if fault.effect:  # of a disturbance of estimated direction on the outputs
@@ -37,7 +29,7 @@ def estimate_line(fault: "Estimate") -> str:
     return "\n".join([fault.label, *("  " + line for line in lines)])
 
 
-def onset_words(fault: "Estimate") -> str:
+def onset_words(fault: Estimate) -> str:
     """State the onset."""
     (low, high), times = fault.onset_interval, [f" ({time})" if time else "" for time in fault.onset_interval_time]
     if fault.onset_censored:
@@ -48,7 +40,7 @@ def onset_words(fault: "Estimate") -> str:
     return f"onset at sample {fault.onset} ({fault.onset_time})" + (f", interval {low} to {high}" if low < high else "")
 
 
-def size_words(fault: "Estimate") -> list[str]:
+def size_words(fault: Estimate) -> list[str]:
     """State each magnitude with its interval."""
     lines = []
     for word, value, (low, high) in zip(magnitude_names(fault), fault.size, fault.size_interval):
@@ -67,20 +59,12 @@ def size_words(fault: "Estimate") -> list[str]:
     return lines
 
 
-def magnitude_names(fault: "Estimate") -> list[str]:
+def magnitude_names(fault: Estimate) -> list[str]:
     """Return the names of the entries of the size."""
-    d = len(fault.size)
-    if fault.kind in ("loss", "stuck"):
-        constants = ["constant added"] if d == 2 else [f"constant added to function {i}" for i in range(1, d)]
-        return ["share lost", *constants]
-    word = WORDS.get(fault.kind, "size")
-    if d == 1:
-        return [word]
-    part = "state" if fault.name.startswith(("state", "process")) else "part"
-    return [f"{word} of {part} {i}" for i in range(1, d + 1)]
+    return kind_of(fault.kind).size_names(fault.name, len(fault.size))
 
 
-def printed(found: "Diagnosis") -> str:
+def printed(found: Diagnosis) -> str:
     """Print a diagnosis in 80 columns."""
     lines = [
         *listed_findings(found.findings),
@@ -93,7 +77,7 @@ def printed(found: "Diagnosis") -> str:
         lines += ["", f"probability {answer.posterior:.3f}, gain {answer.gain:.1f}{mark}"]
         lines += [f"  {line}" for line in str(answer).splitlines()]
     if found.detected:
-        lines += ["", certificate_words(found)] if found.certificate.kind != "none" else [""]
+        lines += ["", certificate_words(found)] if found.certificate.basis != "none" else [""]
     if found.remaining is not None:
         lines += [remaining_words(found)]
     lines += [f"untestable: {label}, {why}" for label, why in found.untestable.items()]
@@ -105,14 +89,14 @@ def printed(found: "Diagnosis") -> str:
     return "\n".join(result)
 
 
-def window_words(found: "Diagnosis") -> str:
+def window_words(found: Diagnosis) -> str:
     """State the length of the record, and when it was taken where that is known."""
     time = found.timeline
     ends = f" from {time.text(0)} to {time.text(found.window - 1)}" if time.dated else ""
     return f"{found.window} samples{ends}"
 
 
-def headline(found: "Diagnosis") -> str:
+def headline(found: Diagnosis) -> str:
     """State the result in one clause."""
     if found.verdict in HEADLINES:
         return HEADLINES[found.verdict]
@@ -123,20 +107,20 @@ def headline(found: "Diagnosis") -> str:
     return f"one of {len(found.candidates)} answers, most probably {found.best.label}"
 
 
-def certificate_words(found: "Diagnosis") -> str:
+def certificate_words(found: Diagnosis) -> str:
     """State the certificate."""
     proof = found.certificate
-    if proof.kind in ("exhaustive", "grid"):
-        tried = "every candidate and onset was tried" if proof.kind == "exhaustive" else "a grid of onsets was tried"
+    if proof.basis in ("exhaustive", "grid"):
+        tried = "every candidate and onset was tried" if proof.basis == "exhaustive" else "a grid of onsets was tried"
         words = f"proof: {tried}; energy explained beyond its threshold {proof.value:.1f}"
         if np.isfinite(proof.runner_up_margin):
             words += f", twice the log-odds against the runner-up {proof.runner_up_margin:.1f}"
         return words
-    if proof.kind == "flat line":
+    if proof.basis == "flat line":
         return f"proof: {proof.value:.0f} readings in a row are identical or missing"
-    if proof.kind == "duality gap":
+    if proof.basis == "duality gap":
         return f"proof: duality gap {proof.value:.1e}"
-    if proof.kind == "infeasible healthy":
+    if proof.basis == "infeasible healthy":
         return (
             f"proof: no healthy course lies within the bounds of the noise unless they are {proof.value:.3g} times as "
             "wide; the parity vector is kept"
@@ -144,7 +128,7 @@ def certificate_words(found: "Diagnosis") -> str:
     return "no proof"
 
 
-def remaining_words(found: "Diagnosis") -> str:
+def remaining_words(found: Diagnosis) -> str:
     """State the residual."""
     rest = found.remaining
     assert rest is not None
@@ -155,7 +139,7 @@ def remaining_words(found: "Diagnosis") -> str:
     return words if found.verdict != "unknown" else f"{words}; {course_words(found)}"
 
 
-def course_words(found: "Diagnosis") -> str:
+def course_words(found: Diagnosis) -> str:
     """State direction and frequency of the residual."""
     rest = found.remaining
     assert rest is not None
@@ -168,7 +152,12 @@ def course_words(found: "Diagnosis") -> str:
     return f"direction {direction}; {speed}, {100 * rest.share:.0f} % of its energy there"
 
 
-def explained(found: "Diagnosis", *, notes: bool = True) -> list[str]:
+def explanation(found: Diagnosis) -> str:
+    """State in three sentences the result, its probability and its evidence."""
+    return " ".join(explained(found))
+
+
+def explained(found: Diagnosis, *, notes: bool = True) -> list[str]:
     """State in sentences the result, its probability and its evidence; notes add what was not judged."""
     name = found.model if found.model.startswith("Hammerstein") else found.model[:1].lower() + found.model[1:]
     departs = f"The record departs from the healthy {name} (p-value {probability_words(found.p_value)}), but "
@@ -198,7 +187,7 @@ def explained(found: "Diagnosis", *, notes: bool = True) -> list[str]:
     return sentences
 
 
-def _faulty(found: "Diagnosis") -> list[str]:
+def _faulty(found: Diagnosis) -> list[str]:
     best, *others = found.candidates
     phrase = " and ".join(
         f"{fault.label} with {onset_words(fault)} and {_list(size_words(fault))}" for fault in best.faults

@@ -13,13 +13,11 @@ from optid.registry import fault_formulation
 if TYPE_CHECKING:
     from optid.data.record import Data
     from optid.faults.consistency.bounded_noise import Membership
-    from optid.faults.consistency.noise_matching import CovarianceMatch
     from optid.faults.consistency.profiles import Profile
     from optid.faults.search.calibration import Thresholds
     from optid.faults.search.scanning import Scan
     from optid.faults.search.sparse import SparseResult
     from optid.faults.signatures import Dictionary
-    from optid.faults.whitening import Whitened
 
 
 def solved(name: str, *arguments: Any, solver: Any = "auto", settings: dict[str, Any] | None = None,
@@ -62,12 +60,3 @@ def profile(found: "Scan", label: str, prior: str = "auto", **how: Any) -> "Prof
     Further arguments are sign, limit, slew, penalties and constraints.
     """
     return solved("fault.profile", found, label, prior=prior, **how)
-
-
-def noise_covariance(found: "Dictionary", whitened: "Whitened", **how: Any) -> "CovarianceMatch":
-    """Match the covariances of a window by additional noise in several places (`fault.noise_covariance`).
-
-    The candidates are those of kind "noise"; if there are none, one for each place in the dictionary. Further arguments
-    are form, lags, onset and constraints.
-    """
-    return solved("fault.noise_covariance", found, whitened, **how)

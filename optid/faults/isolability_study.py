@@ -6,7 +6,7 @@ known onset is optimistic, because the onset is searched, too.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,10 +17,7 @@ from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.search.calibration import check_draws, family_thresholds
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Dictionary
-from optid.show.wording import short
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from optid.registry import Rendered
 
 GRID = np.concatenate([[0.0], np.geomspace(0.5, 600.0, 72)])
 """Deflections at which the probabilities are computed."""
@@ -44,8 +41,8 @@ class Forecast(NamedTuple):
     isolated: float
 
 
-@dataclass(frozen=True, eq=False)
-class Isolability:
+@dataclass(frozen=True, eq=False, repr=False)
+class Isolability(Rendered):
     """Smallest detectable and isolable size of every fault; `print` it, or `plot` it.
 
     Attributes:
@@ -113,53 +110,13 @@ class Isolability:
         """Faults that no record isolates from each other."""
         return [tuple(label.split(" | ")) for label in self.labels if " | " in label]
 
-    def __str__(self) -> str:
-        """Print sizes, rivals and angles, the isolability matrix and remarks, in 80 columns."""
-        where = "unknown" if self.onset == "unknown" else f"known, {self.onset}"
-        lines = [
-            f"window {self.window} samples, onset {where}, false alarm {self.false_alarm:g},",
-            f"probability {self.prob:g} ({self.draws} simulated windows per fault)",
-            "",
-            f"     {'fault':<23}{'detectable':>10}{'isolable':>9}  {'hardest to isolate from':<23}{'sine':>6}",
-        ]
-        for i, label in enumerate(self.labels):
-            rival = self.rivals[i]
-            sine = f"{self.sines[i, self.labels.index(rival)]:6.3f}" if rival else ""
-            lines.append(
-                f"{i + 1:>3}  {short(label, 22):<23}{_size(self.detectable[i]):>10}{_size(self.isolable[i]):>9}"
-                f"  {short(rival, 22):<23}{sine:>6}" + " *" * bool(self.bounded[i])
-            )
-        lines += ["", "smallest size at which the fault of a row is isolated from that of a column"]
-        wide = 7
-        fits = (80 - 5) // wide
-        for first in range(0, len(self.labels), fits):
-            columns = range(first, min(first + fits, len(self.labels)))
-            lines.append("     " + "".join(f"{j + 1:>{wide}}" for j in columns))
-            lines += [
-                f"{i + 1:>3}  " + "".join(f"{_size(self.matrix[i, j]):>{wide}}" for j in columns)
-                for i in range(len(self.labels))
-            ]
-        notes = ["on the diagonal: smallest detectable size"]
-        if self.bounded.any():
-            notes.append("* transient: the signature decays, a longer window does not help")
-        notes += [f"not isolable from each other: {', '.join(group)}" for group in self.ambiguity_groups]
-        notes += [f"excluded: {label}, {why}" for label, why in self.excluded.items()]
-        notes += [f"not judged without data: {label}" for label in self.skipped]
-        return "\n".join(lines + notes).replace(" \n", "\n")
 
-    def plot(self) -> "Figure":
-        """Draw the quantitative isolability matrix and the probabilities by deflection."""
-        from optid.faults.isolability_picture import draw
-
-        return draw(self)
-
-
-def study(
+def isolability(
     found: Dictionary, window: int = 100, *, onset: int | str = "unknown", prob: float = 0.95,
     false_alarm: float = 0.01, draws: int = 1000, calibration: int = 20_000, seed: int | None = 0,
     u: ArrayLike | None = None,
 ) -> Isolability:
-    """Simulate the search for every fault at all sizes.
+    """Return the smallest detectable and isolable size of every fault, by simulating the search for it at all sizes.
 
     Args:
         found: the dictionary.
@@ -211,7 +168,7 @@ def study(
     matrix = np.array([[_crossing(p, prob, draws) for p in row] for row in preferred]) / unit[:, None]
     isolable = np.array([_crossing(p, prob, draws) for p in isolated])
     detectable = np.array([_crossing(p, prob, draws) for p in detected])
-    whole = np.array([1.0 if c.kind == "loss" else np.inf for c in candidates])  # largest possible size
+    whole = np.array([c.fault_kind.largest for c in candidates])  # largest possible size
     sizes = [np.where(d / unit > whole, np.inf, d / unit) for d in (detectable, isolable)]
     labels = tuple(c.label for c in candidates)
     rivals = []
@@ -313,7 +270,3 @@ def _sines(space: Sweep, c: int, known: int | None) -> Array:
     own = axes.T.reshape(-1, *trace.shape[:2])
     cosines = [np.linalg.svd(other.swapaxes(0, 1), compute_uv=False)[:, 0].max() for other in _scores(space, own)]
     return np.sqrt(np.maximum(0.0, 1 - np.minimum(cosines, 1.0) ** 2))
-
-
-def _size(value: float) -> str:
-    return "never" if not np.isfinite(value) else f"{value:.3g}"
