@@ -105,6 +105,8 @@ def test_an_older_file_of_one_output_has_no_pairs():
 
 def test_words_and_prices_of_a_pair(record):
     asked = [words.tau(20.0, channel="valve", output="level"), "gain:low=1010,channel=valve,output=temp"]
+    first = fit(record, constraints=["tau:11,channel=heater,output=temp,number=1"])  # of one; the valve has two
+    assert first.params["tau[temp,heater]"].estimate == pytest.approx(11.0)
     held = fit(record, constraints=asked)
     assert held.params["tau[level,valve]"].estimate == pytest.approx(20.0)
     assert held.params["K[temp,valve]"].estimate == pytest.approx(1010.0, rel=1e-6)
