@@ -123,7 +123,7 @@ def _white_in_time(rows: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, A
     Its correlation over a time h is taken to be exp(-h / tau), at the most likely tau: in the order of the samples the
     past says too little, and inputs would seem to explain what noise did before a gap.
     """
-    def whitened(tau: float) -> tuple[Array, float]:
+    def at_rate(tau: float) -> tuple[Array, float]:
         found, cost = [], 0.0
         for errors, columns, t in rows:
             z = np.column_stack([errors, np.ones(len(errors)), columns])
@@ -135,5 +135,5 @@ def _white_in_time(rows: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, A
         rest = whole[:, 0] - whole[:, 1:2] @ np.linalg.lstsq(whole[:, 1:2], whole[:, 0])[0]
         return whole, len(whole) * float(np.log(max(rest @ rest, 1e-300))) + cost
 
-    best = min((whitened(tau) for tau in FADING), key=lambda one: one[1])[0]
+    best = min((at_rate(tau) for tau in FADING), key=lambda one: one[1])[0]
     return best[:, 0], best[:, 1:2], best[:, 2:]
