@@ -287,8 +287,8 @@ def order(runs):
         for seed in range(runs):
             clean = process_model(word, K=2.0, level=5.0, **parameters).respond(u[:, None])
             y = clean + 0.02 * np.ptp(clean) * np.random.default_rng([seed, 9]).normal(size=200)
-            errors, said = choose_type(process_errors(optid.Data(u, y), "P1D", "linear", Terms()).each[0])
-            name = errors.unknowns.structures[0].word
+            structure, said = choose_type(process_errors(optid.Data(u, y), "P1D", "linear", Terms()))
+            name = structure.word
             chosen[name], open_ = chosen.get(name, 0) + 1, open_ + ("not dis" in said)
         right, tried = right + (word != "P3D") * chosen.get(word, 0), tried + (word != "P3D") * runs
         print(f"type {word}: {chosen}, {open_} not distinguishable from the runner-up", flush=True)
@@ -306,7 +306,7 @@ def main():
     warnings.simplefilter("ignore")
     data = draw("step", 0, 0.02)[0]
     _ = optid.fit(data, "process.exact", process="P1D").params  # compiled
-    errors = process_errors(data, "P1D", "linear", Terms()).each[0]
+    errors = process_errors(data, "P1D", "linear", Terms())
     BranchAndBound(errors, usual_box(errors)).search(np.inf, 0.1, 1.0)
     if "cases" in parts:
         cases(given.runs, given.case)

@@ -24,22 +24,15 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.bases import Bases, Linear
+from optid.bases import Bases
 from optid.core.problem import Problem
 from optid.core.terms import Errors
-from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.fit import fit_processes
-from optid.identify.process.order import choose_types
-from optid.identify.process.outputs import OutputErrors
-from optid.identify.process.pairs import for_outputs
-from optid.identify.process.record import Terms, process_errors, process_type
-from optid.models import Nonlinearity
-from optid.models.process import ProcessModel
-from optid.program.units import outward
+from optid.identify.process.record import Terms, process_errors
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 
@@ -82,77 +75,43 @@ def process(data: Data, *, process: str | Sequence[Any] = "", poles: int = 1, ze
         raise StructureError(f"order={order!r} must be 'auto', or be left out where process names a type")
     if order and process:
         raise StructureError(f"order='auto' chooses the type, which process={process!r} names: give one of both")
-    chosen = process or process_type(poles, zero, delay, integrator)
-    errors = process_errors(data, chosen, basis, Terms(hold, offset, drift, initial))
-    errors, figures = choose_types(errors) if order else (errors, {})
-    return (yield from fit_processes(errors, partial(_problem, errors), tuple(constraints), figures))
+    named = process or f"P{poles}{'D' * bool(delay)}{'I' * bool(integrator)}{'Z' * bool(zero)}"
+    errors = process_errors(data, named, basis, Terms(hold, offset, drift, initial))
+    return (yield from fit_processes(errors, _problem, constraints, bool(order)))
 
 
 process.takes_any_times = True
 
 
-def _problem(errors: OutputErrors, x: Array, constraints: Sequence[Any]) -> Problem:
+def _problem(errors: ProcessErrors, x: Array) -> Problem:
     """Minimise ‖e‖² over the numbers of all processes, the static curves and the levels."""
-    places, one, data = Places.of(errors), errors.each[0], errors.data
-    several = len(errors.each) > 1
-    facts = {"units": one.units, "bases": dict(zip(data.inputs, one.outer_bases))}
+    places, data = Places.of(errors), errors.data
     return Problem(
         "process.exact",
         start=places.values(x),
         terms=(Errors(places.squares, places.value),),
-        further=partial(_signals_of_outputs if several else _signals, errors if several else one),
-        model=partial(_model, errors),
-        facts={"iterate": True, "channels": data.inputs, "outputs": data.outputs, **({} if several else facts)},
-        builders=tuple(for_outputs(errors, constraints)), scale=errors.energy, unit=errors.unit,
-        energy=errors.unit * errors.energy_of_record)
-
-
-def _signals_of_outputs(errors: OutputErrors, variables: Mapping[str, Any], _: Any) -> dict[str, Any]:
-    """Return what constraints speak about in the units of the record: of every output what it has alone."""
-    found = dict[str, Any]()
-    for o, one in enumerate(errors.each):
-        inner = errors.of_output(o, variables)
-        signals = outward({**inner, **_signals(one, inner, None)}, one.units, one.data.inputs, states=False)
-        found |= {errors.outer(o, name): signal for name, signal in signals.items()
-                  if name != "x0" and not name.startswith("dynamics")}
-    return found
+        further=partial(_signals, errors), model=errors.model,
+        facts={"iterate": True, "channels": data.inputs, "outputs": data.outputs,
+               "bases": dict(zip(data.inputs, errors.outer_bases))},
+        scale=errors.energy, unit=errors.unit, energy=errors.unit * errors.energy_of_record)
 
 
 def _signals(errors: ProcessErrors, variables: Mapping[str, Any], _: Any) -> dict[str, Any]:
-    """Return what constraints speak about: parameters in the units of the record, and the static curves."""
-    found, dt, unknowns = dict[str, Any](), errors.data.dt, errors.unknowns
-    for c, structure in enumerate(unknowns.structures):
-        numbers, mu = variables[errors.key("dynamics", c)], variables[errors.key("mu", c)]
+    """Return what constraints speak about in the units of the record: parameters, static curves, and levels."""
+    found, unknowns, units, dt = dict[str, Any](), errors.unknowns, errors.units, errors.data.dt
+    for p, ((o, c), structure) in enumerate(zip(unknowns.pairs, unknowns.structures)):
+        numbers, mu = variables[errors.key("dynamics", p)], variables[errors.key("mu", p)]
         for i, name in enumerate(structure.names):
-            word = f"log {name}" if structure.logarithmic[i] else name
-            entry = cp.hstack([numbers[i]])
-            found[errors.key(word, c)] = (entry if name == "zeta" else entry + np.log(dt)
+            word, entry = f"log {name}" if structure.logarithmic[i] else name, cp.hstack([numbers[i]])
+            found[errors.key(word, p)] = (entry if name == "zeta" else entry + np.log(dt)
                                           if structure.logarithmic[i] else dt * entry)
-        if isinstance(errors.bases[c], Linear):
-            found[errors.key("K", c)] = errors.units.y_scale[0] / errors.units.u_scale[c] * mu
+        found[errors.key("mu", p)] = curve = units.y_scale[o] / units.u_scale[c] * mu
+        if errors.is_line(p):
+            found[errors.key("K", p)] = curve
         if not structure.integrator:
-            found[errors.key("Theta", c)] = cp.reshape(mu, (mu.size, 1), order="F")
-    if "offset" not in variables:
-        level: Any = cp.Constant(np.zeros(1))
-        states = variables.get("x0")
-        if unknowns.levels and states is not None:
-            level = cp.reshape(cp.sum(states[-1]) / unknowns.experiments, (1,), order="F")
-        found["offset"] = level
-    return found
-
-
-def _model(errors: OutputErrors, values: Mapping[str, Array]) -> ProcessModel:
-    """Return the model of named values in the units of the record."""
-    processes, curves, levels, drift = list[Any](), list[Any](), [], []
-    for o, one in enumerate(errors.each):
-        own, unknowns, dt = errors.of_output(o, values), one.unknowns, one.data.dt
-        processes += [process.in_unit(1 / dt) for process in one.processes(Places.of(one).pack(own))]
-        curves += [Nonlinearity(basis, np.atleast_1d(own[one.key("mu", c)])) for c, basis in enumerate(one.bases)]
-        states = np.reshape(own.get("x0", np.zeros(0)), (-1, unknowns.experiments), order="F")
-        levels.append(states[-1] if unknowns.levels else np.atleast_1d(own.get("offset", np.zeros(1))))
-        drift.append(float(np.sum(own.get("drift", 0.0))) / (one.length * dt))
-    every = np.array(levels).T
-    model = ProcessModel(tuple(processes), tuple(curves), every.mean(axis=0), np.array(drift),
-                         "first" if errors.each[0].straight else "zero", errors.pairs,
-                         levels=every if errors.each[0].unknowns.levels else None, **model_meta(errors.data))
-    return model.with_transform(errors.units)
+            found[errors.key("Theta", p)] = cp.reshape(curve, (mu.size, 1), order="F")
+    states, level = variables.get("x0"), variables.get("offset", cp.Constant(np.zeros(unknowns.outputs)))
+    if unknowns.levels and states is not None:
+        level = cp.sum(states[-unknowns.outputs :], axis=1) / unknowns.experiments
+    found["offset"] = cp.multiply(units.y_scale, level) + np.array(units.y_offset)
+    return {**found, "x0": None} if states is not None else found

@@ -14,10 +14,10 @@ from formulations.constraints import process as words
 from optid.errors import DataError, InfeasibleError, RankError, StructureError
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.order import choose_type
-from optid.identify.process.proof import BranchAndBound, box_bounds
+from optid.identify.process.proof import BranchAndBound
 from optid.identify.process.record import Terms, process_errors
 from optid.identify.process.starts import usual_box
-from optid.identify.process.two_poles import step_of_two, two_pole_bounds
+from optid.identify.process.step_courses import step_of_two
 from optid.models.process import ProcessModel, process_model
 from optid.models.process_dynamics import ProcessDynamics, ProcessStructure
 from optid.program.solution import Status
@@ -286,7 +286,7 @@ def test_words_that_do_not_apply_are_refused(process, word, message):
 
 
 def errors_of(data: optid.Data, process: str = "P1D", **options) -> ProcessErrors:
-    return process_errors(data, process, "linear", Terms(**options)).each[0]
+    return process_errors(data, process, "linear", Terms(**options))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -294,15 +294,12 @@ def test_bounds_of_boxes_lie_below_every_point(seed):
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.normal(size=8), 10)
     errors = errors_of(record(process_model("P1D", K=2.0, tau=12.0, dead_time=4.4), u, 0.3, seed), offset=seed % 2 == 0)
-    search = BranchAndBound(errors, usual_box(errors))
-    moves, values, edges, kinks = search.compiled
     low = np.column_stack([rng.uniform(0, 4, 200), rng.uniform(0, 20, 200)])
     size = 10 ** rng.uniform(-3, 0.3, (200, 2))
     boxes = np.column_stack([low[:, 0], low[:, 0] + size[:, 0], low[:, 1], low[:, 1] + size[:, 1]])
-    inside = np.searchsorted(kinks, boxes[:, 3] - 1e-10) - np.searchsorted(kinks, boxes[:, 2] + 1e-10)
-    found = box_bounds(boxes, inside == 0, values, moves, edges)
-    assert np.sum(found[:, 0] > 0.3 * found[:, 1]) > 30  # they say something
-    for (l1, l2, a, b), bound in zip(boxes, found[:, 0]):
+    lower, middle, _ = BranchAndBound(errors, usual_box(errors)).bounds(boxes)
+    assert np.sum(lower > 0.3 * middle) > 30  # they say something
+    for (l1, l2, a, b), bound in zip(boxes, lower):
         for share in rng.uniform(0, 1, (6, 2)):
             x = np.zeros(errors.unknowns.size)
             x[:2] = l1 + share[0] * (l2 - l1), a + share[1] * (b - a)
@@ -327,13 +324,12 @@ def test_bounds_for_two_poles_lie_below_every_point(moves):
     rng = np.random.default_rng(moves)
     u = STEP[:80] if moves == 1 else np.repeat(rng.normal(size=8), 10)
     errors = errors_of(record(process_model("P2D", K=2.0, tau1=12.0, tau2=4.0, dead_time=4.4), u, 0.1, moves), "P2D")
-    moved, values, edges, _ = BranchAndBound(errors, usual_box(errors)).compiled
     low = np.column_stack([rng.uniform(-1, 3, (150, 2)), rng.uniform(0, 20, 150)])
     size = 10 ** rng.uniform(-3, 0.3, (150, 3)) * [1, 1, 3]
     boxes = np.stack([low, low + size], axis=2).reshape(150, 6)
-    found = two_pole_bounds(boxes, values, moved, edges)
-    assert np.sum(found[:, 0] > 0.3 * found[:, 1]) > 50  # they say something
-    for ends, bound in zip(boxes.reshape(150, 3, 2), found[:, 0]):
+    lower, middle, _ = BranchAndBound(errors, usual_box(errors)).bounds(boxes)
+    assert np.sum(lower > 0.3 * middle) > 50  # they say something
+    for ends, bound in zip(boxes.reshape(150, 3, 2), lower):
         for share in (*rng.uniform(0, 1, (4, 3)), *rng.integers(0, 2, (4, 3))):
             x = np.zeros(errors.unknowns.size)
             x[:3] = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])

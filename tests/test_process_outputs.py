@@ -10,7 +10,6 @@ from refusals import refuses
 import optid
 from formulations.constraints import process as words
 from optid.errors import DataError, StructureError
-from optid.identify.informativity import informativity
 from optid.models.process import ProcessModel, process_model
 from optid.program.solution import Status
 from optid.show import charts
@@ -105,6 +104,8 @@ def test_an_older_file_of_one_output_has_no_pairs():
 
 def test_words_and_prices_of_a_pair(record):
     asked = [words.tau(20.0, channel="valve", output="level"), "gain:low=1010,channel=valve,output=temp"]
+    first = fit(record, constraints=["tau:11,channel=heater,output=temp,number=1"])  # of one; the valve has two
+    assert first.params["tau[temp,heater]"].estimate == pytest.approx(11.0)
     held = fit(record, constraints=asked)
     assert held.params["tau[level,valve]"].estimate == pytest.approx(20.0)
     assert held.params["K[temp,valve]"].estimate == pytest.approx(1010.0, rel=1e-6)
@@ -200,8 +201,36 @@ def test_a_model_runs_at_the_times_of_its_record():
     moved = optid.Data(data.u, data.y[:, 0] + 1.5 * np.exp(-(t - t[0]) / found.params["tau"].estimate), dt=1.0, times=t)
     fitted = found.model.simulate(moved, x0="fit")[:, 0] - expected
     np.testing.assert_allclose(fitted, 1.5 * np.exp(-(t - t[0]) / found.params["tau"].estimate), atol=0.05)
-    assert found.verdict is None and found.informativity is None and found.advice == ()
-    assert "not judged" in found.summary() and "defect" not in found.summary()
+
+
+def test_a_model_is_judged_at_irregular_times():
+    """The tests hold their level where errors are coloured in time, and find a response that is too simple."""
+    rng = np.random.default_rng(2)
+    t = np.cumsum(rng.exponential(1.0, 300) + 0.02)
+    u, e = np.repeat(rng.normal(size=30), 10), np.zeros(300)
+    kept = np.exp(-np.diff(t) / 5)
+    for k, a in enumerate(kept, start=1):
+        e[k] = a * e[k - 1] + np.sqrt(1 - a**2) * rng.normal()
+    truth = plant("P1D", K=2.0, tau=12.0, dead_time=3.4)
+    data = optid.Data(u, truth.respond(u[:, None], instants=t) + 0.1 * e, times=t)
+    right, wrong = fit(data, "P1D"), fit(data, "P1", initial="free")
+    judged = {part.name: part for part in right.verdict.parts}
+    assert right.verdict.word == "good" and "irregular times" in right.summary()
+    assert judged["whiteness"].value == "coloured" and judged["error that the inputs explain"].passed
+    assert judged["record"].outcome == judged["structure"].outcome == "-"
+    failed = {part.name for part in wrong.verdict.failed}
+    assert wrong.verdict.word == "poor" and failed >= {"independence of the inputs", "error that the inputs explain"}
+
+
+def test_a_search_at_irregular_times_tries_processes():
+    rng = np.random.default_rng(4)
+    t = np.cumsum(rng.uniform(0.3, 1.7, 160))
+    u = np.repeat(rng.normal(size=16), 10)
+    truth = plant("P1D", K=2.0, tau=6.0, dead_time=3.4)
+    data = optid.Data(u, truth.respond(u[:, None], instants=t) + 0.02 * rng.normal(size=160), times=t)
+    found = optid.identify(data, workers=1, classes=["linear"])
+    assert found.model.orders == {"process": "P1D"} and found.verdict.word == "good"
+    assert found.fit.params["dead_time"].estimate == pytest.approx(3.4, abs=0.2)
 
 
 def test_parts_of_a_record_keep_their_times():
@@ -224,10 +253,8 @@ def test_even_times_are_a_regular_record():
 def test_what_needs_even_distances_refuses_other_records():
     data = irregular()
     for call, message in ((lambda: optid.fit(data, "oe.exact", na=1, nb=1, nk=1), "'oe.exact' needs samples at even"),
-                          (lambda: optid.identify(data), "a search needs"),
                           (lambda: data.decimate(2), "decimate needs"),
-                          (lambda: data.filter(high=0.1), "a filter needs"), (lambda: data.resample(2.0), "resample"),
-                          (lambda: informativity(data), "what a record can tell needs")):
+                          (lambda: data.filter(high=0.1), "a filter needs"), (lambda: data.resample(2.0), "resample")):
         refuses(DataError, rf"{message}.*process\.exact", call)
     regular = optid.Data(np.where(T >= 10, 1.0, 0.0), STEP.respond(np.where(T >= 10, 1.0, 0.0)[:, None]), dt=1.0)
     model = optid.fit(regular, "oe.exact", na=1, nb=2, nk=13).model
@@ -255,6 +282,9 @@ def test_the_command_takes_stamps_as_they_are(tmp_path):
     assert done.exit_code == 0, done.output
     assert "stamps are irregular" in done.output and "optimality is proved" in done.output
     assert "not tested: the samples" in done.output  # of the structure test on the rest
+    searched = CliRunner().invoke(app, ["identify", *common])
+    assert searched.exit_code == 0 and "Search over 1 structures" in searched.output  # of one move
+    assert "process P1D" in searched.output and "samples at irregular times" in searched.output
     read = optid.read(path, "u", "y", gaps="stamps")
     np.testing.assert_allclose(read.time, data.time)
     with pytest.raises(DataError, match=r"gaps='stamps' to keep the stamps"):

@@ -44,9 +44,9 @@ def tau(value: float | None = None, low: float | None = None, high: float | None
     first, *others = (_bounded("tau", *part, pair) for part in parts)
 
     def build(view: View) -> list[Limit]:
-        present = {name.partition("[")[0] for name in view}
-        return first.build(view) + [limit for (those, *_), rule in zip(parts[1:], others)
-                                    if any(f"log {name}" in present for name in those) for limit in rule.build(view)]
+        limits = first.build(view)  # which refuses an input that is missing
+        there = [any(view.key(f"log {name}", channel) in view for name in those) for those, *_ in parts[1:]]
+        return limits + [limit for rule, has in zip(others, there) if has for limit in rule.build(view)]
 
     return Rule(label(f"tau{own}", *pair), build)
 

@@ -79,10 +79,10 @@ def drop_foreign_options(suggestion: Mapping[str, Any], formulation: str) -> dic
     return arguments
 
 
-def at_stamps(how: dict[str, Any], formulation: str) -> dict[str, Any]:
+def at_stamps(how: dict[str, Any], formulation: str = "process.exact") -> dict[str, Any]:
     """Return the reading options with the stamps kept where the formulation takes any times and no repair is asked for.
 
-    `LookupFailed` for an unknown formulation.
+    A search tries `process.exact` on such a record. `LookupFailed` for an unknown formulation.
     """
     from optid.lazy import import_cvxpy
     from optid.registry import formulation as look_up

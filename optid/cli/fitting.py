@@ -105,6 +105,8 @@ def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, spli
     with working(saved, report) as work:
         from optid.cli import arguments as words
 
+        if data:
+            how = words.at_stamps(how)
         record: Any = words.record(data, how, example, seed)[0]
         import_cvxpy()
         from optid.identify.search.search import INTERRUPT

@@ -122,7 +122,7 @@ class Blocks:
             except OptidError:
                 return np.full(self.data.l, np.inf), np.zeros(self.data.l)
             for e, run in zip(around.experiments, runs):
-                begin = round((e.start - self.data.experiments[part.experiment].start) / self.data.dt)
+                begin = self._sample(part.experiment, e.start)
                 rows = slice(max(part.first - begin, 0), max(part.last - begin, 0))
                 y, run = e.y[rows], run[rows]
                 here = np.isfinite(y) & (np.isfinite(run) if horizon is not None else True)
@@ -137,6 +137,13 @@ class Blocks:
         if not count.all():
             raise DataError(f"block {block + 1} has no sample of an output that can be compared: use fewer blocks")
         return energy, variance * count
+
+    def _sample(self, experiment: int, time: float) -> int:
+        """Return the number of the sample of an experiment at a time."""
+        whole = self.data.experiments[experiment]
+        if whole.stamps is None:
+            return round((time - whole.start) / self.data.dt)
+        return int(np.argmin(np.abs(whole.stamps - (time - whole.start))))
 
     def _around(self, part: RepeatedPart) -> Data:
         """Return a part and its surroundings, split where an input is missing: a simulation needs all inputs."""

@@ -160,13 +160,10 @@ class Fit(Rendered):
 
     @property
     def informativity(self) -> Any:
-        """What the record can tell (`optid.identify.informativity.Informativity`); None where its times are irregular.
-
-        None also for a stream.
-        """
+        """What the record can tell (`optid.identify.informativity.Informativity`); None for a stream."""
         from optid.identify.informativity import informativity
 
-        return informativity(self.data) if isinstance(self.data, Data) and self.data.is_regular else None
+        return informativity(self.data) if isinstance(self.data, Data) else None
 
     @property
     def record_findings(self) -> tuple[str, ...]:
@@ -177,11 +174,11 @@ class Fit(Rendered):
     def verdict(self) -> Any:
         """Tests of the model on the record (`optid.identify.verdict.Verdict`), without outliers that the loss left out.
 
-        None for a stream, a record at irregular times, or no model.
+        None for a stream, or no model.
         """
         from optid.identify.verdict import verdict
 
-        if not isinstance(self.data, Data) or not self.data.is_regular or self.model is None:
+        if not isinstance(self.data, Data) or self.model is None:
             return None
         try:
             known = self.uncertainty

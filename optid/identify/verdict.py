@@ -111,7 +111,9 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     if pooled is not None and closed:
         own = ahead  # blocks were compared one sample ahead
     score, lost = (own, 0.0) if pooled is None else (pooled, own - pooled)
-    parts = [Finding("record", re.split(r"[:;(]", told.reason)[0].strip() or "informative", not told.reason)]
+    said = re.split(r"[:;(]", told.reason)[0].strip() or (
+        f"{UNKNOWN}: {told.untested}" if told.untested else "informative")
+    parts = [Finding("record", said, not told.reason, counts=not told.untested)]
     parts.append(Finding("simulation fit" if pooled is None else "cross-validated fit", _points(score),
                          score >= POOR_FIT))
     by_block = _by_block(raw, runs) if cross_validated is None else np.asarray(cross_validated)

@@ -154,9 +154,8 @@ def _trust(fit: "Fit", judged: "Verdict | None", test: Data | None, advise: bool
 
     found = attempt("The fit at first glance", cards)
     if judged is None:
-        why = "samples at even distances" if isinstance(fit.data, Data) else "a record in memory"
-        return [Banner("plain", "The model on this record: not judged", f"The tests of a verdict need {why}.",
-                       tuple(one for one in found if isinstance(one, tuple)))]
+        return [Banner("plain", "The model on this record: not judged", "The tests of a verdict need a record in "
+                       "memory.", tuple(one for one in found if isinstance(one, tuple)))]
     if judged.failed and any(price.binding for price in fit.prices):
         found = [*found, Notes(["An active constraint may be the reason for tests that fail: the record alone would "
                                 "not have it so. See the prices."])]

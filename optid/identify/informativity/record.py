@@ -16,6 +16,7 @@ from optid.phrases import p_equals, plural
 from optid.registry import Rendered
 from optid.threads import one_thread
 
+IRREGULAR = "the samples were taken at irregular times"
 PAIRS = 16  # inputs times outputs up to which a record is examined
 SAME = 0.03  # difference of a gain from one, and of two levels over the spread, below which they are equal
 SHORTEST = 12  # samples of the longest experiment that are
@@ -84,12 +85,9 @@ def informativity(data: Data) -> Informativity:
     """Examine a record, once: excitation, feedback, effects of the inputs, dead times and low-order dynamics.
 
     Args:
-        data: the record; the first 30,000 samples of a longer one are read.
-
-    Raises:
-        DataError: samples at irregular times.
+        data: the record; the first 30,000 samples of a longer one are read. At irregular times nothing but the moves
+            of the inputs is examined.
     """
-    data.refuse_irregular("what a record can tell")
     data = data.raw()
     if data not in _KNOWN:
         with np.errstate(all="ignore"):
@@ -110,6 +108,8 @@ def _examined(data: Data) -> Informativity:
     if not signals.y or any(np.ptp(np.concatenate(signals.outputs(o))) == 0 for o in range(l)):
         return _untested(data, "an output does not move")
     moves = [excitation(signals, c, name) for c, name in enumerate(data.inputs)]
+    if not data.is_regular:
+        return replace(_untested(data, IRREGULAR), excitations=tuple(moves))
     copy = next(copies(signals, data.inputs, data.outputs), None)
     if reason := hopeless(signals, data.inputs, moves) or ("" if copy is None else copy.sentence):
         regulated = copy.input if copy is not None and copy.controller else None

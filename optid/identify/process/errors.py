@@ -2,13 +2,14 @@
 
     y(t) = sum_c G_c(s) exp(-theta_c s) eta_c(u_c)ᵀ mu_c + level + drift t + free motion
 
-Given the dynamics everything else is linear. Times are counted in sampling times, from the first sample of every
-experiment; before it the inputs had their first values. The errors have a kink in a dead time where a delayed change of
-the input meets a sample: there the derivative is the one of a side, or between both that for which the errors are
-stationary in the dead time.
+of every output. Given the dynamics everything else is linear. Times are counted in sampling times, from the first
+sample of every experiment; before it the inputs had their first values. The errors have a kink in a dead time where a
+delayed change of the input meets a sample: there the derivative is the one of a side, or between both that for which
+the errors are stationary in the dead time. Outputs are in units of their own, and independent of each other but for
+what constraints tie: each is searched by itself.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
@@ -17,55 +18,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from optid.arrays import Array
-from optid.bases import Basis
-from optid.data.channels import Transform
+from optid.bases import Basis, Linear
+from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
+from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.descent import Criterion
-from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thin_out
+from optid.identify.prediction_error.tangent_fit import Places
+from optid.identify.process.unknowns import ProcessUnknowns
+from optid.models.nonlinearity import Nonlinearity
+from optid.models.process import ProcessModel
+from optid.models.process_dynamics import ProcessDynamics, thin_out
+from optid.program.compressed import Spread
 from optid.program.units import energy_unit, outer_bases
 from optid.statistics.linearised import Linearised, Method, linearised
-from optid.statistics.unknowns import Unknowns
 
 STEP = 1e-6  # of the differences by which the free motion follows the poles
 AT_KINK = 1e-9  # samples between a dead time and a kink up to which it lies there
-
-
-@dataclass(frozen=True)
-class ProcessUnknowns(Unknowns):
-    """[dynamics0; mu0; dynamics1; mu1; ...; offset; drift; x0]: of every input the numbers of its process, then mu."""
-
-    structures: tuple[ProcessStructure, ...]
-    sizes: tuple[int, ...]  # number of coefficients of every f
-    experiments: int
-    constant: bool = True  # whether there is one level of the output
-    drift: bool = False  # whether the level moves along a straight line
-    free: bool = False  # whether every experiment begins with its own motion
-    levels: bool = False  # whether every experiment has its own level
-    innovations: ClassVar[bool] = False  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    @property
-    def n(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Size of an initial state: of all sections, and of a level."""
-        return self.free * sum(one.order for one in self.structures) + self.levels
-
-    @cached_property
-    def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Sizes of the parts."""
-        found: dict[str, tuple[int, ...]] = {}
-        for c, (structure, size) in enumerate(zip(self.structures, self.sizes)):
-            found |= {f"dynamics{c}": (len(structure.names),), f"mu{c}": (size,)}
-        return found | {"offset": (int(self.constant),), "drift": (int(self.drift),)}
-
-    @cached_property
-    def linear(self) -> NDArray[np.intp]:
-        """Places in x of everything else, in which they are linear."""
-        return np.setdiff1d(np.arange(self.size), self.dynamic)
-
-    @cached_property
-    def dynamic(self) -> NDArray[np.intp]:
-        """Places in x of the numbers of all processes, in which the errors are nonlinear."""
-        every = np.arange(self.size)
-        return np.concatenate([every[self.slices[f"dynamics{c}"]] for c in range(len(self.structures))])
+LARGEST, LARGEST_LOG = 1e7, 100.0  # numbers, and logarithms of them, beyond which nothing is simulated
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,62 +51,108 @@ class InputCourse:
 
 
 @dataclass(frozen=True, eq=False)
+class OutputCourse:
+    """The samples of an output in an experiment that count: those with a value."""
+
+    experiment: int
+    output: int
+    samples: NDArray[np.intp]
+    instants: Array  # of these, in sampling times
+    span: slice  # where they are among all that count
+
+
+@dataclass(frozen=True, eq=False)
 class ProcessErrors(Criterion):
-    """The simulation errors of one output; `data` is the record in the units of the errors."""
+    """The simulation errors of all outputs; `data` is the record in the units of the errors."""
 
     data: Data
     unknowns: ProcessUnknowns
     bases: tuple[Basis, ...]  # of the inputs, in the units of the errors
-    units: Transform  # from those of the record to those of the errors
+    units: Transform  # from those of the errors to those of the record; every output has a size of its own
     instants: tuple[Array, ...] = field(repr=False)  # of every experiment, in sampling times
     straight: bool = False  # whether inputs go straight from sample to sample; else they are held
     every: int = 1  # of so many samples one counts
-    weight: ClassVar[Array] = np.eye(1)  # pyright: ignore[reportIncompatibleVariableOverride]
     gauge: ClassVar[str] = "none"  # pyright: ignore[reportIncompatibleVariableOverride]
-    integrates: ClassVar[bool] = False
+
+    @property
+    def weight(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Every output has the weight of its own units."""
+        return np.eye(self.unknowns.outputs)
 
     @property
     def unit(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What one unit of the sum of squares is in units of the record."""
-        return energy_unit(self.units)
+        """What one unit of the sum of squares is in units of the record; of several outputs there is no common one."""
+        return energy_unit(self.units) if self.unknowns.outputs == 1 else 1.0
 
     @property
     def outer_bases(self) -> tuple[Basis, ...]:
         """The bases of the inputs in the units of the record."""
         return outer_bases(self.bases, self.units)
 
+    def is_line(self, p: int) -> bool:
+        """Whether the static curve of a pair is a straight line."""
+        return isinstance(self.bases[self.unknowns.pairs[p][1]], Linear)
+
     def key(self, name: str, number: int) -> str:
-        """Name a quantity of an input: plain with one input, ``name[input]`` with several."""
-        return name if self.data.m == 1 else f"{name}[{self.data.inputs[number]}]"
+        """Name a quantity of a pair: plain with one input, ``name[input]`` with several, ``name[output,input]``."""
+        o, c = self.unknowns.pairs[number]
+        if self.unknowns.outputs > 1:
+            return f"{name}[{self.data.outputs[o]},{self.data.inputs[c]}]"
+        return name if self.data.m == 1 else f"{name}[{self.data.inputs[c]}]"
+
+    # -- outputs -----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def each(self) -> tuple["ProcessErrors", ...]:
+        """The errors of every output alone."""
+        if self.unknowns.outputs == 1:
+            return (self,)
+        u = self.units
+        return tuple(replace(self, data=self.data.select(outputs=name), unknowns=self.unknowns.of_output(o)[0],
+                             units=replace(u, y_scale=u.y_scale[o : o + 1], y_offset=u.y_offset[o : o + 1]))
+                     for o, name in enumerate(self.data.outputs))
+
+    @cached_property
+    def places(self) -> list[NDArray[np.intp]]:
+        """Places in x of the unknowns of every output alone."""
+        return [self.unknowns.of_output(o)[1] for o in range(self.unknowns.outputs)]
+
+    def join(self, parts: list[Array]) -> Array:
+        """Return x of the unknowns of every output."""
+        x = np.zeros(self.unknowns.size)
+        for places, part in zip(self.places, parts):
+            x[places] = part
+        return x
 
     # -- the record --------------------------------------------------------------------------------------------------
 
     @cached_property
-    def places(self) -> list[NDArray[np.intp]]:
-        """Samples of every experiment that count: those with an output."""
-        return [np.flatnonzero(np.isfinite(e.y[:, 0]))[:: self.every] for e in self.data.experiments]
-
-    @cached_property
-    def read_at(self) -> list[Array]:
-        """Instants of the samples that count, per experiment."""
-        return [t[at] for t, at in zip(self.instants, self.places)]
+    def courses(self) -> list[OutputCourse]:
+        """The outputs of all experiments."""
+        found, end = [], 0
+        for i, (e, t) in enumerate(zip(self.data.experiments, self.instants)):
+            for o in range(self.unknowns.outputs):
+                at = np.flatnonzero(np.isfinite(e.y[:, o]))[:: self.every]
+                found.append(OutputCourse(i, o, at, t[at], slice(end, end + len(at))))
+                end += len(at)
+        return found
 
     @cached_property
     def y(self) -> Array:
-        """The outputs that count, of all experiments one after another."""
-        return np.concatenate([e.y[at, 0] for e, at in zip(self.data.experiments, self.places)])
-
-    @cached_property
-    def spans(self) -> list[slice]:
-        """Where the samples of every experiment are in `y`."""
-        edges = np.cumsum([0, *(len(at) for at in self.places)]).tolist()
-        return [slice(a, b) for a, b in zip(edges, edges[1:])]
+        """The outputs that count, one course after another."""
+        return np.concatenate([self.data.experiments[one.experiment].y[one.samples, one.output]
+                               for one in self.courses])
 
     @cached_property
     def drives(self) -> list[list[InputCourse]]:
         """The functions of the inputs, [experiment][input]."""
         return [[InputCourse(*thin_out(t, one.values(e.u[:, c]), self.straight)) for c, one in enumerate(self.bases)]
                 for e, t in zip(self.data.experiments, self.instants)]
+
+    def courses_of(self, p: int) -> Iterator[tuple[OutputCourse, InputCourse]]:
+        """Yield the courses of the output and of the input of a pair, experiment by experiment."""
+        o, c = self.unknowns.pairs[p]
+        yield from ((one, self.drives[one.experiment][c]) for one in self.courses if one.output == o)
 
     def first_part(self, most: int, changes: int) -> "ProcessErrors":
         """Return the errors of about so many samples of every experiment, of its beginning if inputs change more."""
@@ -153,14 +168,14 @@ class ProcessErrors(Criterion):
         return replace(self, data=data, instants=tuple(t[:n] for t, n in zip(self.instants, sizes)),
                        every=self.every * max(1, max(sizes) // most))
 
-    def kinks(self, c: int, theta: float) -> tuple[float, float]:
-        """Return the dead times next below and above at which a delayed change of input c meets a sample.
+    def kinks(self, p: int, theta: float) -> tuple[float, float]:
+        """Return the dead times next below and above at which a delayed change of the input of a pair meets a sample.
 
         The larger one may be theta itself, the smaller one not.
         """
         below, above = -np.inf, np.inf
-        for t, drives in zip(self.read_at, self.drives):
-            changes = drives[c].changes[1:]
+        for one, drive in self.courses_of(p):
+            t, changes = one.instants, drive.changes[1:]
             at = np.searchsorted(t, changes + theta - AT_KINK)
             if len(t) and len(changes):
                 below = max(below, float(np.max((t[np.maximum(at - 1, 0)] - changes)[at > 0], initial=-np.inf)))
@@ -171,43 +186,36 @@ class ProcessErrors(Criterion):
     # -- responses ---------------------------------------------------------------------------------------------------
 
     def processes(self, x: Array) -> list[ProcessDynamics]:
-        """Return the dynamics of every input in x, in sampling times; a dead time below zero by rounding is none."""
+        """Return the dynamics of every pair in x, in sampling times; a dead time below zero by rounding is none."""
         found = []
-        for c, one in enumerate(self.unknowns.structures):
-            p = one.parameters(x[self.unknowns.slices[f"dynamics{c}"]])
-            if one.delay and -AT_KINK <= p[-1] < 0:
-                p[-1] = 0.0
-            found.append(ProcessDynamics(one, p))
+        for p, one in enumerate(self.unknowns.structures):
+            values = one.parameters(x[self.unknowns.slices[f"dynamics{p}"]])
+            if one.delay and -AT_KINK <= values[-1] < 0:
+                values[-1] = 0.0
+            found.append(ProcessDynamics(one, values))
         return found
 
     def columns(self, x: Array, late: bool = True) -> Array:
-        """Return what the output is linear in (rows, L) for the dynamics in x, in the order of x without these."""
-        dynamics, u = self.processes(x), self.unknowns
-        found = np.zeros((len(self.y), u.size - len(u.dynamic)))
-        position = 0
-        for c, one in enumerate(dynamics):
-            part = slice(position, position + u.sizes[c])
-            for t, drives, span in zip(self.read_at, self.drives, self.spans):
-                drive = drives[c]
-                found[span, part] = one.response(t, drive.changes, drive.about_rest, straight=self.straight,
-                                                 late=late)[:, 0]
+        """Return what the outputs are linear in (rows, L) for the dynamics in x, in the order of x without these."""
+        u, processes = self.unknowns, self.processes(x)
+        found = np.zeros((len(self.y), u.size))
+        for p, one in enumerate(processes):
+            for course, drive in self.courses_of(p):
+                into = found[course.span, u.slices[f"mu{p}"]]
+                into[:] = one.response(course.instants, drive.changes, drive.about_rest, straight=self.straight,
+                                       late=late)[:, 0]
                 if not one.structure.integrator:
-                    found[span, part] += drive.values[0]
-            position = part.stop
-        if u.constant:
-            found[:, position] = 1.0
-            position += 1
-        if u.drift:
-            found[:, position] = np.concatenate(self.read_at) / self.length
-            position += 1
-        for i, (t, span) in enumerate(zip(self.read_at, self.spans)):
-            first = position + i * u.n
-            if u.free:
-                modes = np.hstack([one.free_response(t, 0.0) for one in dynamics])
-                found[span, first : first + modes.shape[1]] = modes
-            if u.levels:
-                found[span, first + u.n - 1] = 1.0
-        return found
+                    into += drive.values[0]
+                if u.free:
+                    states = found[course.span, u.shared + course.experiment * u.n :]
+                    states[:, u.sections[p]] = one.free_response(course.instants, 0.0)
+        for course in self.courses:
+            last = u.shared + (course.experiment + 1) * u.n - u.outputs
+            for there, first, values in ((u.constant, u.slices["offset"].start, 1.0), (u.levels, last, 1.0),
+                                         (u.drift, u.slices["drift"].start, course.instants / self.length)):
+                if there:
+                    found[course.span, first + course.output] = values
+        return found[:, u.linear]
 
     @cached_property
     def length(self) -> float:
@@ -215,26 +223,24 @@ class ProcessErrors(Criterion):
         return max(float(t[-1]) for t in self.instants) or 1.0
 
     def slopes(self, x: Array, late: bool = True) -> Array:
-        """Return the derivatives (rows, k) of the output by the numbers of all processes."""
-        u, found = self.unknowns, []
-        for c, one in enumerate(self.processes(x)):
-            mu, parts = x[u.slices[f"mu{c}"]], []
-            for t, drives in zip(self.read_at, self.drives):
-                drive = drives[c]
-                response = one.response(t, drive.changes, (drive.about_rest @ mu)[:, None], straight=self.straight,
-                                        late=late, sensitive=True)
-                parts.append(response[:, 1:, 0] * one.weights)
-            found.append(np.vstack(parts))
-        slopes = np.hstack(found)
+        """Return the derivatives (rows, k) of the outputs by the numbers of all processes."""
+        u = self.unknowns
+        found = np.zeros((len(self.y), u.size))
+        for p, one in enumerate(self.processes(x)):
+            mu = x[u.slices[f"mu{p}"]]
+            for course, drive in self.courses_of(p):
+                response = one.response(course.instants, drive.changes, (drive.about_rest @ mu)[:, None],
+                                        straight=self.straight, late=late, sensitive=True)
+                found[course.span, u.slices[f"dynamics{p}"]] = response[:, 1:, 0] * one.weights
+        slopes = found[:, u.dynamic]
         if u.free:  # the free motion is smooth in the poles, and there are few
-            linear = x[u.linear]
-            first = len(linear) - u.n * u.experiments
-            names = [name for one in u.structures for name in one.names]
-            for j, place in enumerate(u.dynamic):
-                if names[j] == "dead_time":  # which does not delay it
+            motion = x[u.shared :]
+            for j, ((_, name), place) in enumerate(zip(u.numbers, u.dynamic)):
+                if name == "dead_time":  # which does not delay it
                     continue
-                ends = [self.columns(x + sign * STEP * np.eye(u.size)[place], late)[:, first:] for sign in (1, -1)]
-                slopes[:, j] += (ends[0] - ends[1]) @ linear[first:] / (2 * STEP)
+                ends = [self.columns(x + sign * STEP * np.eye(u.size)[place], late)[:, -len(motion) :]
+                        for sign in (1, -1)]
+                slopes[:, j] += (ends[0] - ends[1]) @ motion / (2 * STEP)
         return slopes
 
     def simulate(self, x: Array) -> Array:
@@ -244,7 +250,7 @@ class ProcessErrors(Criterion):
     # -- what descents and programmes need ---------------------------------------------------------------------------
 
     def _matrix(self, x: Array) -> tuple[Array, Array]:
-        """Return the derivatives (rows, size) of the output in the order of x, and the errors."""
+        """Return the derivatives (rows, size) of the outputs in the order of x, and the errors."""
         u, linear = self.unknowns, self.columns(x)
         errors = linear @ x[u.linear] - self.y
         matrix = np.zeros((len(errors), u.size))
@@ -254,10 +260,10 @@ class ProcessErrors(Criterion):
 
     def _between(self, x: Array, errors: Array) -> Array:
         """Return `slopes`; a dead time at a kink has a derivative between those of both sides."""
-        slopes = self.slopes(x)
-        for c, structure in enumerate(self.unknowns.structures):
-            theta, place = x[self.unknowns.slices[f"dynamics{c}"]][-1] if structure.delay else 0.0, self.place(c)
-            if not structure.delay or self.kinks(c, theta)[1] > theta + AT_KINK:
+        slopes, u = self.slopes(x), self.unknowns
+        for p, place in u.delays.items():
+            theta = float(x[u.dynamic[place]])
+            if self.kinks(p, theta)[1] > theta + AT_KINK:
                 continue
             less, more = slopes[:, place], self.slopes(x, late=False)[:, place]
             down, up = less @ errors, more @ errors
@@ -265,36 +271,38 @@ class ProcessErrors(Criterion):
             slopes[:, place] = (1 - share) * less + share * more
         return slopes
 
-    def cell(self, x: Array, c: int) -> tuple[float, float]:
-        """Return the dead times of input c between which the errors are as smooth as from x; at a kink the better side.
+    def cell(self, x: Array, p: int) -> tuple[float, float]:
+        """Return the dead times of a pair between which the errors are as smooth as from x; at a kink the better side.
 
         Both are that of x where it is the best one near it.
         """
-        theta = float(x[self.unknowns.slices[f"dynamics{c}"]][-1])
-        low, high = self.kinks(c, theta)
+        place = self.unknowns.delays[p]
+        theta = float(x[self.unknowns.dynamic[place]])
+        low, high = self.kinks(p, theta)
         if high > theta + AT_KINK:
             return low, high
-        errors, place = self.simulate(x) - self.y, self.place(c)
+        errors = self.simulate(x) - self.y
         down, up = (self.slopes(x, late)[:, place] @ errors for late in (True, False))
         if up < 0:
-            return theta, self.kinks(c, theta + 10 * AT_KINK)[1]
+            return theta, self.kinks(p, theta + 10 * AT_KINK)[1]
         return (theta, theta) if down < 0 else (low, theta)
 
-    def place(self, c: int) -> int:
-        """Return the place of the dead time of input c among the numbers of all processes."""
-        return sum(len(one.names) for one in self.unknowns.structures[: c + 1]) - 1
-
     def rows(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
-        """Return a generator of the rows [x0 | shared | error] of experiment i, zero where an output is missing."""
+        """Return a generator of the rows [x0 | shared | error] of experiment i, the outputs of a sample in turn.
+
+        They are zero where an output is missing.
+        """
         matrix, errors = self._matrix(x)
         shared, n = self.unknowns.shared, self.unknowns.n
 
         def of(i: int) -> Iterator[tuple[Array, int]]:
-            span, at = self.spans[i], self.places[i]
-            block = np.zeros((len(self.instants[i]), n + shared + 1))
-            states = slice(shared + i * n, shared + (i + 1) * n)
-            block[at] = np.column_stack([matrix[span, states], matrix[span, :shared], errors[span]])
-            yield block, len(at)
+            block = np.zeros((len(self.instants[i]), self.unknowns.outputs, n + shared + 1))
+            here = [one for one in self.courses if one.experiment == i]
+            for one in here:
+                states = slice(shared + i * n, shared + (i + 1) * n)
+                block[one.samples, one.output] = np.column_stack(
+                    [matrix[one.span, states], matrix[one.span, :shared], errors[one.span]])
+            yield block.reshape(-1, block.shape[2]), sum(len(one.samples) for one in here)
 
         return of
 
@@ -303,25 +311,51 @@ class ProcessErrors(Criterion):
         u = self.unknowns
         return linearised(self.rows(x), u.experiments, u.n, u.shared, method=method)
 
+    def compress(self, at: Linearised, reference: Array) -> CompressedErrors:
+        """Return the compressed errors near a point."""
+        return (CompressedErrors if self.unknowns.outputs == 1 else CompressedOutputs)(self, at, reference)
+
     def value(self, x: Array) -> float:
         """Return the sum of squared errors at x."""
         return float(np.sum((self.simulate(x) - self.y) ** 2))
 
     def admissible(self, x: Array) -> bool:
-        """Whether the numbers are those of a process: finite, no dead time negative."""
-        if not np.all(np.isfinite(x)) or np.max(np.abs(x[self.unknowns.dynamic]), initial=0.0) > 1e7:
-            return False
-        return all(not one.delay or x[self.unknowns.slices[f"dynamics{c}"]][-1] >= -AT_KINK
-                   for c, one in enumerate(self.unknowns.structures)) and all(
-            np.max(np.abs(x[self.unknowns.slices[f"dynamics{c}"]][one.logarithmic]), initial=0.0) < 100
-            for c, one in enumerate(self.unknowns.structures))
-
-    def gauge_rows(self, x: Array) -> Array:
-        """Return no directions."""
-        return np.zeros((0, self.unknowns.shared))
+        """Whether the numbers are those of processes: finite, no dead time negative."""
+        u, numbers = self.unknowns, x[self.unknowns.dynamic]
+        return bool(np.isfinite(x).all() and np.all(np.abs(numbers) <= LARGEST)
+                    and np.all(np.abs(numbers[u.logarithmic]) < LARGEST_LOG)
+                    and all(numbers[place] >= -AT_KINK for place in u.delays.values()))
 
     def with_linear(self, x: Array, linear: ArrayLike) -> Array:
         """Return the dynamics of x with other linear unknowns."""
         found = np.array(x, dtype=float)
         found[self.unknowns.linear] = linear
         return found
+
+    def model(self, values: Mapping[str, Array]) -> ProcessModel:
+        """Return the model of named values in the units of the record."""
+        u, dt, data = self.unknowns, self.data.dt, self.data
+        processes = tuple(one.in_unit(1 / dt) for one in self.processes(Places.of(self).pack(values)))
+        curves = tuple(Nonlinearity(self.bases[c], np.atleast_1d(values[self.key("mu", p)]))
+                       for p, (_, c) in enumerate(u.pairs))
+        states = np.reshape(values.get("x0", np.zeros(0)), (-1, u.experiments), order="F")
+        levels = states[-u.outputs :].T if u.levels else values.get("offset", np.zeros(u.outputs))[None]
+        drift = np.asarray(values.get("drift", np.zeros(u.outputs))) / (self.length * dt)
+        model = ProcessModel(processes, curves, levels.mean(axis=0), drift, "first" if self.straight else "zero",
+                             u.pairs, levels=levels if u.levels else None, **model_meta(data))
+        return model.with_transform(self.units)
+
+
+@dataclass(eq=False)
+class CompressedOutputs(CompressedErrors):
+    """The compressed errors of several outputs, each with a noise of its own size; see `CompressedErrors`."""
+
+    criterion: ProcessErrors
+
+    def one_step_fit(self, values: object) -> None:
+        """Return nothing: the sum of squares is that of all outputs."""
+
+    def spread(self, z: Array, moves: Array) -> Spread:
+        """Return the scatter under the noise of all outputs, which may be correlated."""
+        found, sizes = self._sandwich(self._noise(z, moves), moves), self.criterion.units.y_scale
+        return replace(found, noise=found.noise * np.outer(sizes, sizes))

@@ -25,7 +25,8 @@ from optid.identify.process.descent import (
     sharpen,
 )
 from optid.identify.process.errors import ProcessErrors
-from optid.identify.process.outputs import OutputErrors
+from optid.identify.process.order import choose_types
+from optid.identify.process.pairs import for_outputs
 from optid.identify.process.profile import DeadTimeProfiles
 from optid.identify.process.proof import REASON, applies, better_start, certify
 from optid.identify.process.separation import (
@@ -57,102 +58,123 @@ class Found:
     steps: int = 0
 
 
-def fit_processes(errors: OutputErrors, pose: Callable[[Array, Sequence[Any]], Problem], constraints: Sequence[Any],
-                  known: Mapping[str, Any] | None = None) -> Procedure:
+@dataclass(frozen=True, eq=False)
+class ProcessFit:
+    """Errors, and the problem of the fit about a point."""
+
+    errors: ProcessErrors
+    pose: Callable[[ProcessErrors, Array], Problem]
+    constraints: tuple[Any, ...]
+
+    def problem(self, x: Array) -> Problem:
+        """Return the problem about a point, under constraints that are each about one output."""
+        return self.pose(self.errors, x).subject_to(*for_outputs(self.errors, self.constraints))
+
+    def refine(self, problem: Problem, x: Array, figures: Mapping[str, Any], steps: int = 0) -> Procedure:
+        """Let a back end confirm a point, or go on from it."""
+        fit = TangentFit(problem, self.errors, self.errors.compress)
+        return (yield from refine(fit, Descent(x, self.errors.linearise(x), steps, True), figures, x))
+
+    def confirm(self, x: Array, figures: Mapping[str, Any], steps: int = 0, late: float = np.inf) -> Procedure:
+        """Confirm a point; numbers at their usual bounds, and dead times that are not late, stay within."""
+        problem, held = self.problem(x), _at_bounds(self.errors, x, late)
+        if held:
+            problem = replace(problem, restrictions=(partial(_bounds, held),))
+        return (yield from self.refine(problem, x, figures, steps))
+
+
+def fit_processes(errors: ProcessErrors, pose: Callable[[ProcessErrors, Array], Problem], constraints: Sequence[Any],
+                  auto: bool = False) -> Procedure:
     """Search for the best optimum within the bounds that single constraints give, and confirm it under all.
 
     Every output is searched by itself; the confirmation, and constraints that tie several numbers, see all of them.
 
     Args:
         errors: the criterion.
-        pose: states the problem of the fit about a point, with constraints.
-        constraints: of the user.
-        known: figures that are known already.
+        pose: states the problem of the fit about a point, without constraints of the user.
+        constraints: these.
+        auto: whether the types of the processes are chosen first.
 
     Raises:
         RankError: too few samples, no visible response, or parameters that the record does not separate.
     """
+    errors, said = choose_types(errors) if auto else (errors, "")
+    fit = ProcessFit(errors, pose, tuple(constraints))
     for one in errors.each:
         enough_rows(len(one.y), "output samples", one.unknowns.size, "poles")
     usual = [usual_box(one) for one in errors.each]
-    middle = errors.join([_middle(one, box) for one, box in zip(errors.each, usual)])
-    boxes, complete = read_boxes(pose(middle, constraints), errors, usual)
+    boxes, complete = read_boxes(fit.problem(errors.join(list(map(_middle, errors.each, usual)))), errors, usual)
     found = [_searched(one, box, complete) for one, box in zip(errors.each, boxes)]
     names = errors.data.outputs if len(found) > 1 else ("",)
-    figures = {**(known or {}), **{f"{name}{' of ' * bool(output)}{output}": said
-                                   for output, one in zip(names, found) for name, said in one.figures.items()}}
+    figures = {**({"process type": said} if auto else {}), **{f"{name}{' of ' * bool(output)}{output}": word
+               for output, one in zip(names, found) for name, word in one.figures.items()}}
     bests = [one.best for one in found]
     x = errors.join([best.x for best in bests])
     if complete:
-        evidence = yield from _confirmed(errors, pose, constraints, x, figures, max(one.steps for one in found), LATE)
+        evidence = yield from fit.confirm(x, figures, max(one.steps for one in found), LATE)
         if evidence is None:
             return None
         if evidence.status is Status.INACCURATE:
-            evidence = _judged_along(errors, boxes, bests, evidence)
+            evidence = _judged_along(bests, boxes, evidence)
         if evidence.status is Status.LOCAL and not all(map(applies, errors.each)):
             evidence = replace(evidence, reason=REASON)
-        return replace(evidence, profiles=DeadTimeProfiles(errors, boxes, [best.x for best in bests]),
+        return replace(evidence, profiles=DeadTimeProfiles(errors, boxes, bests),
                        bound=partial(_certified, errors, boxes, bests))
     ends = []
     for number in range(max(len(one.points) for one in found) + 1):
         start = x if not number else errors.join(
             [one.points[min(number, len(one.points)) - 1].x for one in found])
-        within = replace(pose(start, constraints), restrictions=(partial(_cell, errors),))
-        fit = TangentFit(within, errors, errors.compress)
-        end = yield from refine(fit, _descent(errors, start), dict(figures), start)
+        within = replace(fit.problem(start), restrictions=(partial(_cell, errors),))
+        end = yield from fit.refine(within, start, dict(figures))
         if end is None:
             return None
-        at = fit.places.pack(end.values or {})
-        ends.append((fit.excess(at) > INSIDE, end.objective, at))
-    return (yield from _confirmed(errors, pose, constraints, min(ends, key=lambda one: one[:2])[2], figures))
+        at = Places.of(errors).pack(end.values or {})
+        ends.append((TangentFit(within, errors, errors.compress).excess(at) > INSIDE, end.objective, at))
+    return (yield from fit.confirm(min(ends, key=lambda one: one[:2])[2], figures))
 
 
 def _searched(errors: ProcessErrors, box: ProcessBox, complete: bool) -> Found:
     """Search for the best optimum of one output; where the box is all there is, to the last digits."""
     points = best_descents(errors, box)
     several = points[: 2 if len(errors.y) <= LONG else 1]
-    best, steps = min((search_cells(errors, one, box) for one in several), key=lambda one: one.value), 0
-    figures = {"starts": _agreement(points, best)}
+    best, steps = min((search_cells(one, box) for one in several), key=lambda one: one.value), 0
+    same = sum(one.value <= best.value * (1 + 1e-3) for one in points)
+    figures = {"starts": f"{same} of {len(points)} descents from the grid end within 0.1 % of the best"}
     if complete:
-        best, steps = sharpen(errors, join_equal(errors, _past_the_grid(errors, box, best)), box)
-        best = join_equal(errors, best)
-        refuse_silence(errors, best)
-        refuse_inseparable(errors, box, best)
-        figures |= {name: said for name, said in {"start": warn_of_motion(errors, best),
-                                                  "bounds": describe_bounds(errors, best),
-                                                  "not determined": describe_flatness(errors, best),
-                                                  "time constants": describe_equal_ones(errors, best)}.items() if said}
+        best, steps = sharpen(join_equal(_past_the_grid(best, box)), box)
+        best = join_equal(best)
+        refuse_silence(best)
+        refuse_inseparable(best, box)
+        told = {"start": warn_of_motion(best), "bounds": describe_bounds(best),
+                "not determined": describe_flatness(best), "time constants": describe_equal_ones(best)}
+        figures |= {name: said for name, said in told.items() if said}
     return Found(best, points, figures, steps)
 
 
-def _past_the_grid(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> ProcessPoint:
+def _past_the_grid(best: ProcessPoint, box: ProcessBox) -> ProcessPoint:
     """Go on from what a coarse search over boxes finds to be better, if anything."""
     for _ in range(ROUNDS):
-        point = better_start(errors, box, best.value)
+        point = better_start(best.errors, box, best.value)
         if point is None:
             break
-        x = best.x.copy()
-        x[errors.unknowns.dynamic] = point
-        end = search_cells(errors, descend(errors, x, box)[0], box)
+        end = search_cells(descend(best.errors, best.at(point).x, box)[0], box)
         if end.value >= best.value:
             break
         best = end
     return best
 
 
-def _judged_along(errors: OutputErrors, boxes: Sequence[ProcessBox], bests: Sequence[ProcessPoint],
-                  evidence: Evidence) -> Evidence:
+def _judged_along(bests: Sequence[ProcessPoint], boxes: Sequence[ProcessBox], evidence: Evidence) -> Evidence:
     """Judge a point that the last programme would move far, in a direction that the record hardly shows."""
-    falls = max(falls_along(*one) for one in zip(errors.each, bests, boxes))
     flat = [said for name, said in evidence.figures.items() if name.startswith("not determined")]
-    if falls <= CONFIRMED:
+    if max(map(falls_along, bests, boxes)) <= CONFIRMED:
         return replace(evidence, status=Status.LOCAL)
     return replace(evidence, reason=f"{evidence.reason}{'; not determined is ' * bool(flat)}{'; '.join(flat)}")
 
 
-def _certified(errors: OutputErrors, boxes: Sequence[ProcessBox], bests: Sequence[ProcessPoint]) -> Bound:
+def _certified(errors: ProcessErrors, boxes: Sequence[ProcessBox], bests: Sequence[ProcessPoint]) -> Bound:
     """Bound the sum of squares of every output from below, and so their sum."""
-    found = [certify(*one) for one in zip(errors.each, boxes, (best.value for best in bests))]
+    found = [certify(best, box) for best, box in zip(bests, boxes)]
     if len(found) == 1:
         return found[0]
     reasons = dict.fromkeys(bound.reason for bound in found)
@@ -162,41 +184,22 @@ def _certified(errors: OutputErrors, boxes: Sequence[ProcessBox], bests: Sequenc
                  words if len(reasons) > 1 else found[0].reason)
 
 
-def _confirmed(errors: OutputErrors, pose: Callable[[Array, Sequence[Any]], Problem], constraints: Sequence[Any],
-               x: Array, figures: Mapping[str, Any], steps: int = 0, late: float = np.inf) -> Procedure:
-    """Let a back end confirm a point; numbers at their usual bounds, and dead times that are not late, stay within."""
-    problem, held = pose(x, constraints), _at_bounds(errors, x, late)
-    if held:
-        problem = replace(problem, restrictions=(partial(_bounds, held),))
-    fit = TangentFit(problem, errors, errors.compress)
-    return (yield from refine(fit, _descent(errors, x, steps), figures, x))
-
-
-def _descent(errors: OutputErrors, x: Array, steps: int = 0) -> Descent:
-    return Descent(x, errors.linearise(x), steps, True)
-
-
 def _middle(errors: ProcessErrors, box: ProcessBox) -> Array:
     x = np.ones(errors.unknowns.size)
     x[errors.unknowns.dynamic] = (box.low + box.high) / 2
     return x
 
 
-def _agreement(points: Sequence[ProcessPoint], best: ProcessPoint) -> str:
-    same = sum(one.value <= best.value * (1 + 1e-3) for one in points)
-    return f"{same} of {len(points)} descents from the grid end within 0.1 % of the best"
-
-
 # -- constraints ---------------------------------------------------------------------------------------------------
 
 
-def read_boxes(problem: Problem, errors: OutputErrors, boxes: Sequence[ProcessBox]
+def read_boxes(problem: Problem, errors: ProcessErrors, boxes: Sequence[ProcessBox]
                ) -> tuple[Sequence[ProcessBox], bool]:
     """Return the boxes within the constraints that bound one number each, and whether these are all."""
     low, high = (np.concatenate(ends) for ends in zip(*((box.low, box.high) for box in boxes)))
-    complete = True
-    names = [errors.key("dynamics", pair) for pair in range(len(errors.pairs))]
-    places = np.concatenate([np.arange(problem.space.size)[problem.space.places[name]] for name in names])
+    complete, every = True, np.arange(problem.space.size)
+    places = np.concatenate([every[problem.space.places[errors.key("dynamics", p)]]
+                             for p in range(len(errors.unknowns.pairs))])
     for one in problem.constraints():
         if one.name in problem.structural:
             continue
@@ -221,37 +224,37 @@ def read_boxes(problem: Problem, errors: OutputErrors, boxes: Sequence[ProcessBo
     return [ProcessBox(*ends) for ends in zip(np.split(low, edges), np.split(high, edges))], complete
 
 
-def _cell(errors: OutputErrors, view: Any) -> dict[str, Any]:
+def _numbers(errors: ProcessErrors, view: Any) -> cp.Expression:
+    """Return the variables of the numbers of all processes."""
+    return cp.hstack([view.inner[errors.key("dynamics", p)] for p in range(len(errors.unknowns.pairs))])
+
+
+def _usual(errors: ProcessErrors) -> tuple[Array, Array]:
+    """Return the usual bounds of the numbers of all outputs."""
+    low, high = (np.concatenate(ends) for ends in zip(*((box.low, box.high) for box in map(usual_box, errors.each))))
+    return low, high
+
+
+def _cell(errors: ProcessErrors, view: Any) -> dict[str, Any]:
     """Keep every dead time in its cell about the point where the constraints are read, other numbers at usual sizes."""
     places = Places.of(errors)
     x = places.pack({name: view.reference[name] for name in places.names})
-    lows, highs = [], []
-    for one, part in zip(errors.each, errors.split(x)):
-        box = usual_box(one)
-        low, high = box.low.copy(), box.high.copy()
-        for c, structure in enumerate(one.unknowns.structures):
-            if structure.delay:
-                low[one.place(c)], high[one.place(c)] = one.cell(part, c)
-        lows.append(low)
-        highs.append(high)
-    numbers = cp.hstack([view.inner[errors.key("dynamics", pair)] for pair in range(len(errors.pairs))])
-    return {CELL: [numbers >= np.concatenate(lows), numbers <= np.concatenate(highs)]}
+    low, high = _usual(errors)
+    for p, place in errors.unknowns.delays.items():
+        low[place], high[place] = errors.cell(x, p)
+    numbers = _numbers(errors, view)
+    return {CELL: [numbers >= low, numbers <= high]}
 
 
-def _at_bounds(errors: OutputErrors, x: Array, late: float) -> list[tuple[str, int, float, float]]:
+def _at_bounds(errors: ProcessErrors, x: Array, late: float) -> list[tuple[str, int, float, float]]:
     """Return (variable, entry, sign, bound) of numbers at their usual bounds, and of dead times up to a late one."""
-    found, pair = [], 0
-    for one, part in zip(errors.each, errors.split(x)):
-        box, j = usual_box(one), 0
-        for c, structure in enumerate(one.unknowns.structures):
-            for i, name in enumerate(structure.names):
-                value, near = part[one.unknowns.slices[f"dynamics{c}"]][i], late if name == "dead_time" else NEAR
-                if value <= box.low[j] + near:
-                    found.append((errors.key("dynamics", pair), i, 1.0, float(box.low[j])))
-                if value >= box.high[j] - (1e-9 if name == "dead_time" else NEAR):
-                    found.append((errors.key("dynamics", pair), i, -1.0, float(box.high[j])))
-                j += 1
-            pair += 1
+    found, (low, high) = [], _usual(errors)
+    for value, (p, name), least, most in zip(x[errors.unknowns.dynamic], errors.unknowns.numbers, low, high):
+        there = errors.key("dynamics", p), errors.unknowns.structures[p].names.index(name)
+        if value <= least + (late if name == "dead_time" else NEAR):
+            found.append((*there, 1.0, float(least)))
+        if value >= most - (1e-9 if name == "dead_time" else NEAR):
+            found.append((*there, -1.0, float(most)))
     return found
 
 

@@ -4,15 +4,13 @@ A second-order factor stands for two poles, real or complex; where the chosen on
 fitted with these.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from optid.errors import RankError, StructureError
-from optid.identify.process.descent import ProcessPoint, search_cells
+from optid.identify.process.descent import search_cells
 from optid.identify.process.errors import ProcessErrors
-from optid.identify.process.outputs import OutputErrors
 from optid.identify.process.starts import best_descents, usual_box
 from optid.models.process_dynamics import ProcessStructure
 
@@ -21,65 +19,49 @@ EVIDENCE = 2.0  # difference of the criterion up to which two types are not dist
 FLOOR = 1e-20  # share of the energy of the output below which errors are rounding
 
 
-@dataclass(frozen=True, eq=False)
-class RankedType:
-    """A type that was tried, with its criterion and the point where it is best."""
+def try_type(errors: ProcessErrors, structure: ProcessStructure) -> tuple[float, ProcessStructure]:
+    """Return the Bayesian information criterion of a type for all inputs, and the type with real poles if it has any.
 
-    structure: ProcessStructure
-    criterion: float
-    point: ProcessPoint
-
-    @property
-    def named(self) -> ProcessStructure:
-        """The type, with real poles where the second-order factor has these."""
-        names = self.structure.names
-        if not self.structure.pair or self.point.x[names.index("zeta")] < 0:
-            return self.structure
-        return replace(self.structure, real=self.structure.real + 2, pair=False)
+    Where there are several inputs the poles of the first one decide.
+    """
+    u = errors.unknowns
+    tried = replace(errors, unknowns=replace(u, structures=(structure,) * len(u.pairs)))
+    box, count = usual_box(tried), len(errors.y)
+    best = search_cells(best_descents(tried, box)[0], box)
+    criterion = count * np.log(max(best.value, FLOOR * errors.energy) / count) + len(best.x) * np.log(count)
+    if structure.pair and best.numbers[structure.names.index("zeta")] >= 0:
+        structure = replace(structure, real=structure.real + 2, pair=False)
+    return criterion, structure
 
 
-def try_type(errors: ProcessErrors, structure: ProcessStructure) -> RankedType:
-    """Return a type for all inputs with its Bayesian information criterion."""
-    tried = replace(errors, unknowns=replace(errors.unknowns, structures=(structure,) * errors.data.m))
-    box = usual_box(tried)
-    best = search_cells(tried, best_descents(tried, box)[0], box)
-    count = len(errors.y)
-    value = max(best.value, FLOOR * errors.energy)
-    return RankedType(structure, count * np.log(value / count) + tried.unknowns.size * np.log(count), best)
-
-
-def choose_types(errors: OutputErrors) -> tuple[OutputErrors, dict[str, Any]]:
+def choose_types(errors: ProcessErrors) -> tuple[ProcessErrors, str]:
     """Return the errors with the types that the criterion chooses for every output, and what it says of runners-up.
 
     `RankError` as of `choose_type`.
     """
-    each, words = zip(*(choose_type(one) for one in errors.each))
-    said = words[0] if len(words) == 1 else "; ".join(
-        f"{output}: {word}" for output, word in zip(errors.data.outputs, words))
-    return replace(errors, each=each), {"process type": said}
+    found = [choose_type(one) for one in errors.each]
+    structures = tuple(found[o][0] for o, _ in errors.unknowns.pairs)
+    said = [f"{f'{output}: ' * (len(found) > 1)}{word}" for output, (_, word) in zip(errors.data.outputs, found)]
+    return replace(errors, unknowns=replace(errors.unknowns, structures=structures)), "; ".join(said)
 
 
-def choose_type(errors: ProcessErrors) -> tuple[ProcessErrors, str]:
-    """Return the errors of an output with the type that the criterion chooses, and what it says of the runner-up.
+def choose_type(errors: ProcessErrors) -> tuple[ProcessStructure, str]:
+    """Return the type that the criterion chooses for an output, and what it says of the runner-up.
 
     Raises:
         RankError: too few samples for the smallest type and its runner-up.
     """
-    found, reasons = list[RankedType](), list[str]()
-    for word in CANDIDATES:
-        structure = ProcessStructure.read(word)
+    found, reasons = list[tuple[float, ProcessStructure]](), list[str]()
+    for structure in map(ProcessStructure.read, CANDIDATES):
         if len(errors.y) < 2 * (len(structure.names) * errors.data.m + errors.unknowns.size):
             continue
         try:
             found.append(try_type(errors, structure))
         except (StructureError, np.linalg.LinAlgError) as error:
-            reasons.append(f"{word}: {error}")
+            reasons.append(f"{structure.word}: {error}")
     if len(found) < 2:
         raise RankError(f"{len(errors.y)} output samples are too few to compare process types"
                         f"{'; '.join(['', *reasons])}: name one (process='P1D')")
-    found.sort(key=lambda one: one.criterion)
-    best, second = found[:2]
-    behind = second.criterion - best.criterion
-    word = (f"not distinguishable from {second.named.word}" if behind < EVIDENCE else f"runner-up {second.named.word}")
-    chosen = replace(errors, unknowns=replace(errors.unknowns, structures=(best.named,) * errors.data.m))
-    return chosen, f"{best.named.word} by BIC, {word}, {behind:.1f} behind"
+    (least, best), (other, second) = sorted(found, key=lambda one: one[0])[:2]
+    runner_up = f"{'not distinguishable from' if other - least < EVIDENCE else 'runner-up'} {second.word}"
+    return best, f"{best.word} by BIC, {runner_up}, {other - least:.1f} behind"

@@ -7,11 +7,11 @@ from inspect import signature
 from typing import Any
 
 from optid.errors import StructureError
-from optid.identify.process.outputs import OF_OUTPUTS, OutputErrors
+from optid.identify.process.errors import ProcessErrors
 from optid.program.view import View
 
 
-def for_outputs(errors: OutputErrors, constraints: Sequence[Any]) -> Iterator[Any]:
+def for_outputs(errors: ProcessErrors, constraints: Sequence[Any]) -> Iterator[Any]:
     """Yield constraints so that each is about one output: recorded rules about the one they name, or every one.
 
     Others, such as functions of the user, see the quantities of all pairs: ``view["K[level,valve]"]``.
@@ -19,20 +19,22 @@ def for_outputs(errors: OutputErrors, constraints: Sequence[Any]) -> Iterator[An
     Raises:
         StructureError: a rule that takes ``output`` and names none, or an unknown one.
     """
+    names = errors.data.outputs
     for rule in constraints:
         call = getattr(rule, "call", None)
-        if len(errors.each) == 1 or call is None:
+        if len(names) == 1 or call is None:
             yield rule
             continue
-        names, known = errors.data.outputs, signature(getattr(import_module(call[0]), call[1]))
+        known = signature(getattr(import_module(call[0]), call[1]))
         given = known.bind(*call[2], **call[3]).arguments
         if "output" in known.parameters and given.get("output") not in names:
             wrong = f"names no output {given['output']!r}" if given.get("output") else "needs output="
             raise StructureError(f"constraint {rule.name!r} {wrong}; the outputs are {', '.join(names)}")
-        for o, one in enumerate(errors.each):
-            if given.get("output", names[o]) == names[o] and not (
-                    "output" not in given and given.get("channel") in set(errors.data.inputs) - set(one.data.inputs)):
-                yield OfOutput(rule, errors, o, rule.name if "output" in given else f"{rule.name} of {names[o]}")
+        for o, name in enumerate(names):
+            inputs = [errors.data.inputs[c] for output, c in errors.unknowns.pairs if output == o]
+            idle = "output" not in given and given.get("channel") in set(errors.data.inputs) - set(inputs)
+            if given.get("output", name) == name and not idle:
+                yield OfOutput(rule, errors, o, rule.name if "output" in given else f"{rule.name} of {name}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,21 +42,24 @@ class OfOutput:
     """A rule about one of several outputs, under a name of its own."""
 
     rule: Any
-    errors: OutputErrors
+    errors: ProcessErrors
     output: int
     name: str
 
     def __call__(self, view: View) -> dict[str, Any]:
-        """Build the rule in the quantities of the output."""
-        one, outer = self.errors.each[self.output], self.errors.outer
-        words = {name.partition("[")[0] for name in view.inner} - {"x0"}
-        channels = ("",) if len(one.data.inputs) == 1 else [f"[{name}]" for name in one.data.inputs]
-        names = [*OF_OUTPUTS, *(word + channel for word in words - set(OF_OUTPUTS) for channel in channels)]
-        there = {name: outer(self.output, name) for name in names}
-        own = {name: whole for name, whole in there.items() if whole in view.inner}
-        part = view.part({name: view.inner[whole] for name, whole in own.items()}, iterate=view.iterate,
-                         channels=one.data.inputs, outputs=one.data.outputs, reference=Renamed(view.reference, own),
-                         bases=dict(zip(one.data.inputs, one.outer_bases)))
+        """Build the rule in the quantities of the output, named as if it were the only one."""
+        data, pairs = self.errors.data, self.errors.unknowns.pairs
+        inputs = tuple(data.inputs[c] for o, c in pairs if o == self.output)
+        bases = {data.inputs[c]: basis for c, basis in enumerate(self.errors.outer_bases)}
+        own = {}
+        for one in inputs:
+            ending = f"[{data.outputs[self.output]},{one}]"
+            own |= {name.removesuffix(ending) + f"[{one}]" * (len(inputs) > 1): name for name in view.inner
+                    if name.endswith(ending)}
+        inner = {name: view.inner[whole] for name, whole in own.items()}
+        inner["offset"] = view.inner["offset"][self.output : self.output + 1]
+        part = view.part(inner, iterate=view.iterate, channels=inputs, outputs=(data.outputs[self.output],),
+                         reference=Renamed(view.reference, own), bases={one: bases[one] for one in inputs})
         return {self.name: self.rule.build(part)}
 
 

@@ -1,30 +1,24 @@
 """A proof that no other time constants and dead time fit better: branch and bound for one or two poles with dead time.
 
-With a held input that moves by w_j at s_j the response of a pole with dead time is
-
-    x(t) = w_0 + sum_j w_j S((t - s_j - theta) / tau),    S(z) = 1 - exp(-z) for z > 0, else 0,
-
-and V(log tau, theta) = min over gain and levels of |y - K x|². A box of (log tau, theta) is discarded where a lower
-bound of V there lies above what was found. In a box across kinks x is known up to an interval, since S falls in both
-unknowns. In a cell, x = x0 + a x1 + b x2 + r with |a| <= h1, |b| <= h2 and r within an envelope of its second
-derivatives: least squares over K, K a and K b in their cone, less the largest K |r|, is a lower bound. Boxes are halved
-at kinks first. What is not discarded holds the optimum: its middle is a start that no grid can miss. Two real poles are
-searched likewise, in three unknowns and without kinks, see `two_poles`.
+V(log tau, theta) = min over gain and levels of |y - K x|². A box is discarded where a lower bound of V there lies above
+what was found. Anywhere in it the response is x = x0 + r with |r| bounded; where there is no kink inside also
+x = x0 + sum a_i x_i + r with |a_i| <= h_i and a smaller r: least squares over K and K a_i in their cone, less the
+largest K |r|, is a lower bound (`step_courses` bounds r). Boxes are halved at kinks first. What is not discarded holds
+the optimum: its middle is a start that no grid can miss.
 """
 
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
-from optid.identify.process.cones import most_explained, norm, products, project
-from optid.identify.process.descent import ProcessBox
+from optid.identify.process.descent import ProcessBox, ProcessPoint
 from optid.identify.process.errors import ProcessErrors
-from optid.identify.process.two_poles import two_pole_bounds
-from optid.kernel_cache import cached_njit
+from optid.identify.process.step_courses import one_pole_courses, two_pole_courses
 from optid.models.process_dynamics import ProcessStructure
 from optid.program.solution import Bound
 
@@ -34,75 +28,41 @@ PIECES = 8  # of the range of every unknown at the beginning
 SECONDS = {2: 20.0, 3: 15.0}  # of the processor, after which a proof is given up, by unknowns
 WORK, LEAST = 2e6, 1000  # responses to single moves that the coarse pass may compute; boxes that it needs at least
 MOST = {2: 5e6, 3: 1e3}  # responses to single moves in one bound beyond which no proof is tried, by unknowns
+BATCH, ENTRIES = 2000, 200_000  # boxes that are bounded together, and entries of their courses
+RIDGE = 1e-13  # of scaled normal equations, for columns that are all but parallel
 METHOD = "branch and bound over time constants and dead time"
 REASON = ("a lower bound is known for one or two real poles with dead time, one held input, a straight static curve "
           "and a start at rest alone; elsewhere several starts are compared")
 
 
-@cached_njit
-def box_bounds(boxes, smooth, record, moves, edges):
-    """Return (lower bound, V at the middle, effects of both halves) of boxes.
+def most_explained(gram: Array, side: Array, h: Array) -> Array:
+    """Return the most (B,) of the energy of a signal that K (x_0 + sum a_i x_i) explains with |a_i| <= h_i.
+
+    The faces of the cone are tried one by one, its interior first. On a face some a_i are at their ends; the optimum of
+    a face counts where it obeys the other bounds.
 
     Args:
-        boxes: (B, 4) log tau from, to; theta from, to.
-        smooth: (B,) whether no kink lies inside.
-        record: of all experiments one after another: instants (N,), outputs (N,) and orthonormal columns (N, c), which
-            are projected out of the outputs already, response (N,) before the moves.
-        moves: times (J,) and sizes (J,) of the moves, by experiment.
-        edges: (E + 1, 2) first sample, and first move, of every experiment.
+        gram: (B, 1 + d, 1 + d) Gram matrices of the columns x.
+        side: (B, 1 + d) their products with the signal.
+        h: (B, d).
     """
-    t, y, still, base = record
-    s, w = moves
-    count, n = len(boxes), len(t)
-    found = np.zeros((count, 4))
-    x, envelope = np.zeros((3, n)), np.zeros(n)
-    energy = 0.0
-    for k in range(n):
-        energy += y[k] * y[k]
-    for i in range(count):
-        l1, l2, a, b = boxes[i]
-        low_tau, high_tau, tau = np.exp(l1), np.exp(l2), np.exp((l1 + l2) / 2)
-        h1, h2, theta = (l2 - l1) / 2, (b - a) / 2, (a + b) / 2
-        for e in range(len(edges) - 1):
-            for k in range(edges[e, 0], edges[e + 1, 0]):
-                x0, x1, x2, rest = base[k], 0.0, 0.0, 0.0
-                for j in range(edges[e, 1], edges[e + 1, 1]):
-                    since = t[k] - s[j] - theta
-                    size = abs(w[j])
-                    if smooth[i]:
-                        if since <= 0.0:
-                            continue
-                        z = since / tau
-                        decay = np.exp(-z)
-                        x0 += w[j] * (1 - decay)
-                        x1 -= w[j] * z * decay
-                        x2 -= w[j] * decay / tau
-                        za, zb = max(since - h2, 0.0) / high_tau, (since + h2) / low_tau
-                        m = max(abs(1 - za), abs(1 - zb))
-                        rest += size * np.exp(-za) * (h1 * h1 / 2 * zb * m + h1 * h2 * m / low_tau
-                                                      + h2 * h2 / (2 * low_tau * low_tau))
-                    elif since + h2 > 0.0:
-                        middle = 1 - np.exp(-since / tau) if since > 0.0 else 0.0
-                        up = 1 - np.exp(-(since + h2) / low_tau)
-                        down = 1 - np.exp(-(since - h2) / high_tau) if since > h2 else 0.0
-                        x0 += w[j] * middle
-                        rest += size * max(up - middle, middle - down)
-                x[0, k], x[1, k], x[2, k], envelope[k] = x0, x1, x2, rest
-        project(x, still)
-        gram, side = products(x, y)
-        rho = norm(envelope)
-        first, second = h1 * np.sqrt(gram[1, 1]), h2 * np.sqrt(gram[2, 2])
-        change, length = rho + first + second, np.sqrt(gram[0, 0])
-        at_middle = energy - side[0] * side[0] / gram[0, 0] if gram[0, 0] > 0.0 else energy
-        lower = 0.0
-        if change < length:
-            largest = np.sqrt(energy) / (length - change)  # of the gain anywhere in the box
-            least = energy - most_explained(gram, side, np.array([h1, h2])) if smooth[i] else at_middle
-            lower = max(np.sqrt(max(least, 0.0)) - largest * rho, 0.0) ** 2
-        found[i, 0], found[i, 1] = lower, at_middle
-        found[i, 2] = first if smooth[i] else h1 * length
-        found[i, 3] = second if smooth[i] else h2 / tau * length
-    return found
+    best, left = np.zeros(len(gram)), np.arange(len(gram))
+    for ends in sorted(product((0, -1, 1), repeat=h.shape[1]), key=lambda one: sum(map(abs, one))):
+        inside = np.flatnonzero(np.equal(ends, 0))
+        basis = np.zeros((len(left), h.shape[1] + 1, len(inside) + 1))
+        basis[:, 0, 0], basis[:, 1:, 0] = 1.0, np.array(ends) * h[left]
+        basis[:, inside + 1, np.arange(len(inside)) + 1] = 1.0
+        flipped = np.swapaxes(basis, 1, 2)
+        inner, right = flipped @ gram[left] @ basis, (flipped @ side[left][:, :, None])[:, :, 0]
+        scale = np.sqrt(np.maximum(np.einsum("bii->bi", inner), 1e-300))
+        inner = inner / scale[:, :, None] / scale[:, None, :] + RIDGE * np.eye(len(inside) + 1)
+        v = np.linalg.solve(inner, (right / scale)[:, :, None])[:, :, 0]
+        obeyed = np.all(np.abs(v[:, 1:] / scale[:, 1:]) <= h[left][:, inside] * np.abs(v[:, :1] / scale[:, :1])
+                        * (1 + 1e-9), axis=1)
+        best[left] = np.maximum(best[left], np.where(obeyed, np.sum(v * right / scale, axis=1), 0.0))
+        if len(inside) == h.shape[1]:  # an optimum inside the cone is that of the cone
+            left = left[~obeyed]
+    return best
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +71,7 @@ class Search:
 
     bound: float
     best: float
-    point: Array  # (d,) logarithms of the time constants and theta of the best middle
+    point: Array  # the middle
     left: Array  # (B, 2 d) boxes that were not discarded
     boxes: int
 
@@ -124,37 +84,55 @@ class BranchAndBound:
     box: ProcessBox
 
     @cached_property
-    def compiled(self) -> tuple[tuple[Array, ...], tuple[Array, ...], NDArray[np.intp], Array]:
-        """Moves, record and edges as `box_bounds` takes them, and the dead times at which a move meets a sample."""
-        s, w, edges, base = [], [], [(0, 0)], []
-        for t, drives in zip(self.errors.read_at, self.errors.drives):
-            drive = drives[0]
-            s.append(drive.changes[1:])
-            w.append(np.diff(drive.values[:, 0]))
-            base.append(np.full(len(t), drive.values[0, 0]))
-            edges.append((edges[-1][0] + len(t), edges[-1][1] + len(s[-1])))
-        kinks = np.unique(np.concatenate([np.subtract.outer(t, one).ravel()
-                                          for t, one in zip(self.errors.read_at, s)]))
-        inside = (kinks > self.box.low[-1]) & (kinks < self.box.high[-1])
-        kinks = kinks[inside]
-        kept = np.concatenate([[True], np.diff(kinks) > 1e-9]) if len(kinks) else np.zeros(0, dtype=bool)
-        still, y = self._projected()
-        record = np.concatenate(self.errors.read_at), y, still, np.concatenate(base)
-        return (np.concatenate(s), np.concatenate(w)), record, np.array(edges), kinks[kept]
+    def kinks(self) -> Array:
+        """The dead times at which a move of the input meets a sample."""
+        found = np.unique(np.concatenate([np.subtract.outer(one.instants, drive.changes[1:]).ravel()
+                                          for one, drive in self.errors.courses_of(0)]))
+        found = found[(found > self.box.low[-1]) & (found < self.box.high[-1])]
+        return found[np.diff(found, prepend=-np.inf) > 1e-9]
 
-    def _projected(self) -> tuple[Array, Array]:
-        """Orthonormal columns that do not move, and the outputs without them."""
-        errors = self.errors
-        x = np.zeros(errors.unknowns.size)
-        x[errors.unknowns.dynamic] = (self.box.low + self.box.high) / 2
-        still = np.linalg.qr(errors.columns(x)[:, 1:])[0]
-        return np.ascontiguousarray(still), errors.y - still @ (still.T @ errors.y)
+    @cached_property
+    def record(self) -> tuple[Array, Array]:
+        """Orthonormal columns (rows, c) that do not move, and the outputs (rows,) without them."""
+        x = np.zeros(self.errors.unknowns.size)
+        x[self.errors.unknowns.dynamic] = (self.box.low + self.box.high) / 2
+        still = np.linalg.qr(self.errors.columns(x)[:, 1:])[0]
+        return still, self.errors.y - still @ (still.T @ self.errors.y)
 
     @property
     def work(self) -> int:
         """Responses to single moves in one bound."""
-        moves = sum(len(t) * (len(drives[0].changes) - 1) for t, drives in zip(self.errors.read_at, self.errors.drives))
-        return max(moves, 1)
+        return max(sum(len(one.instants) * (len(drive.changes) - 1) for one, drive in self.errors.courses_of(0)), 1)
+
+    def bounds(self, boxes: Array) -> tuple[Array, Array, Array]:
+        """Return lower bounds (B,) on V over boxes (B, 2 d), V at their middles, and the effects (B, d) of halves."""
+        still, y = self.record
+        parts, smooth = [], self._inside(boxes) == 0
+        for one, drive in self.errors.courses_of(0):
+            moves = one.instants, drive.changes[1:], np.diff(drive.values[:, 0])
+            x, *rests = one_pole_courses(boxes, smooth, *moves) if boxes.shape[1] == 4 else two_pole_courses(
+                boxes, *moves)
+            x[:, 0] += drive.values[0, 0]
+            parts.append((x, *rests))
+        x, rough, fine = (np.concatenate(part, axis=-1) if part[1:] else part[0] for part in zip(*parts))
+        flat = x.reshape(-1, x.shape[2])
+        flat -= (flat @ still) @ still.T
+        gram, side, energy = np.einsum("bin,bjn->bij", x, x), x @ y, float(y @ y)
+        sizes = np.sqrt(np.einsum("bii->bi", gram))
+        length, h = sizes[:, 0], np.diff(_ends(boxes))[:, :, 0] / 2
+        middle = energy - np.where(length > 0, side[:, 0] / np.where(length > 0, length, 1.0), 0.0) ** 2
+        effects, rest = h * sizes[:, 1:], np.linalg.norm(fine, axis=1)
+        tangent = energy - most_explained(gram, side, h)
+        lower = np.zeros(len(boxes))
+        for least, away, moved in ((middle, np.linalg.norm(rough, axis=1), 0.0), (tangent, rest, effects.sum(axis=1))):
+            shortest = length - away - moved  # of x anywhere in the box
+            known = shortest > 0
+            largest = np.sqrt(energy) / shortest[known]  # of the gain
+            found = np.sqrt(np.maximum(least[known], 0.0)) - largest * away[known]
+            lower[known] = np.maximum(lower[known], np.maximum(found, 0.0) ** 2)
+        slowest = np.exp(_ends(boxes)[:, :-1].mean(axis=2).max(axis=1))
+        plain = np.column_stack([h[:, :-1], h[:, -1] / slowest])
+        return lower, middle, np.where((rest + effects.sum(axis=1) < 2 * length)[:, None], effects, plain)
 
     def search(self, value: float, gap: float, seconds: float, most: float = np.inf) -> Search:
         """Discard boxes whose bound lies above (1 - gap) times a value, or times a better one found on the way.
@@ -169,18 +147,19 @@ class BranchAndBound:
         lows, highs = (np.meshgrid(*(end[part] for end in ends)) for part in (slice(None, -1), slice(1, None)))
         boxes = np.column_stack([side.ravel() for pair in zip(lows, highs) for side in pair])
         count, bound, begun, best, point = 0, np.inf, time.thread_time(), np.inf, self.box.low
+        size = int(np.clip(ENTRIES // len(self.errors.y), 10, BATCH))
         while len(boxes := self._different(boxes)):
             if time.thread_time() - begun > seconds or count > most:
                 break
-            part, boxes = boxes[-2000:], boxes[:-2000]
-            found, middles = self._bounded(part)
+            part, boxes = boxes[-size:], boxes[:-size]
+            lower, middle, effects = self.bounds(part)
             count += len(part)
-            k = int(np.argmin(found[:, 1]))
-            if found[k, 1] < best:
-                best, point = float(found[k, 1]), part[k].reshape(-1, 2).mean(axis=1)
-            out = found[:, 0] >= min(value, best) * (1 - gap)
-            bound = min(bound, float(np.min(found[out, 0], initial=np.inf)))
-            boxes = np.vstack([boxes, _halves(part[~out], np.argmax(found[~out, 2:], axis=1), middles[~out])])
+            k = int(np.argmin(middle))
+            if middle[k] < best:
+                best, point = float(middle[k]), part[k].reshape(-1, 2).mean(axis=1)
+            out = lower >= min(value, best) * (1 - gap)
+            bound = min(bound, float(np.min(lower[out], initial=np.inf)))
+            boxes = np.vstack([boxes, self._halves(part[~out], np.argmax(effects[~out], axis=1))])
         return Search(min(bound, value), best, point, boxes, count)
 
     def _different(self, boxes: Array) -> Array:
@@ -190,21 +169,26 @@ class BranchAndBound:
             return boxes
         return boxes[boxes[:, 1] > boxes[:, 2]]
 
-    def _bounded(self, boxes: Array) -> tuple[Array, Array]:
-        """Return what the kernel says of boxes, and where every unknown is halved: a dead time at a kink near there."""
-        moves, record, edges, kinks = self.compiled
-        middles = boxes.reshape(len(boxes), boxes.shape[1] // 2, 2).mean(axis=2)
-        if middles.shape[1] == 3:
-            return two_pole_bounds(boxes, record, moves, edges), middles
-        early, late = boxes[:, 2], boxes[:, 3]
-        inside = np.searchsorted(kinks, late - 1e-10) - np.searchsorted(kinks, early + 1e-10)
-        if len(kinks):
-            at = np.searchsorted(kinks, middles[:, 1])
-            before, after = kinks[np.maximum(at - 1, 0)], kinks[np.minimum(at, len(kinks) - 1)]
+    def _inside(self, boxes: Array) -> NDArray[np.intp]:
+        """Return how many kinks lie inside of boxes; two poles have none."""
+        if boxes.shape[1] > 4:
+            return np.zeros(len(boxes), dtype=np.intp)
+        return np.searchsorted(self.kinks, boxes[:, 3] - 1e-10) - np.searchsorted(self.kinks, boxes[:, 2] + 1e-10)
+
+    def _halves(self, boxes: Array, wide: NDArray[np.intp]) -> Array:
+        """Return both halves of boxes (B, 2 d), of the unknown (B,) that changes more; theta at a kink near there."""
+        ends = _ends(boxes)
+        middles, kinked = ends.mean(axis=2), self._inside(boxes) > 0
+        if kinked.any():
+            at = np.searchsorted(self.kinks, middles[:, 1])
+            before, after = self.kinks[np.maximum(at - 1, 0)], self.kinks[np.minimum(at, len(self.kinks) - 1)]
             near = np.where(np.abs(before - middles[:, 1]) < np.abs(after - middles[:, 1]), before, after)
-            kink = (inside > 0) & (near > early + 1e-10) & (near < late - 1e-10)
-            middles[:, 1] = np.where(kink, near, middles[:, 1])
-        return box_bounds(boxes, inside == 0, record, moves, edges), middles
+            kinked &= (near > boxes[:, 2] + 1e-10) & (near < boxes[:, 3] - 1e-10)
+            middles[:, 1] = np.where(kinked, near, middles[:, 1])
+        split = np.equal.outer(wide, np.arange(ends.shape[1]))
+        first = np.stack([ends[:, :, 0], np.where(split, middles, ends[:, :, 1])], axis=2)
+        second = np.stack([np.where(split, middles, ends[:, :, 0]), ends[:, :, 1]], axis=2)
+        return np.vstack([first.reshape(boxes.shape), second.reshape(boxes.shape)])
 
     def certify(self, value: float) -> Bound:
         """Return the lower bound on V within the box for a point with this value."""
@@ -231,20 +215,16 @@ class BranchAndBound:
         return f"{samples * self.errors.data.dt:.4g} {self.errors.data.time_unit}".rstrip()
 
 
-def _halves(boxes: Array, wide: NDArray[np.intp], middles: Array) -> Array:
-    """Return both halves of boxes (B, 2 d): of the unknown (B,) that changes more, at its middle (B, d)."""
-    ends = boxes.reshape(len(boxes), boxes.shape[1] // 2, 2)
-    split = np.equal.outer(wide, np.arange(ends.shape[1]))
-    first = np.stack([ends[:, :, 0], np.where(split, middles, ends[:, :, 1])], axis=2)
-    second = np.stack([np.where(split, middles, ends[:, :, 0]), ends[:, :, 1]], axis=2)
-    return np.vstack([first.reshape(boxes.shape), second.reshape(boxes.shape)])
+def _ends(boxes: Array) -> Array:
+    """Return the ends (B, d, 2) of boxes (B, 2 d)."""
+    return boxes.reshape(len(boxes), boxes.shape[1] // 2, 2)
 
 
 def applies(errors: ProcessErrors) -> bool:
     """Whether a lower bound is known: one or two real poles with dead time, straight f, held input, start at rest."""
-    u, known = errors.unknowns, (ProcessStructure(1), ProcessStructure(2))
-    return (len(u.structures) == 1 and u.structures[0] in known and u.sizes == (1,) and not u.free
-            and not errors.straight and type(errors.bases[0]).__name__ == "Linear")
+    u = errors.unknowns
+    return (u.structures in ((ProcessStructure(1),), (ProcessStructure(2),)) and errors.is_line(0) and not u.free
+            and not errors.straight)
 
 
 def better_start(errors: ProcessErrors, box: ProcessBox, value: float) -> Array | None:
@@ -258,9 +238,9 @@ def better_start(errors: ProcessErrors, box: ProcessBox, value: float) -> Array 
     return found.point if found.best < value * (1 - GAP) else None
 
 
-def certify(errors: ProcessErrors, box: ProcessBox, value: float) -> Bound:
+def certify(best: ProcessPoint, box: ProcessBox) -> Bound:
     """Bound the errors of a fit within a box from below, in units of the record, where there is a method."""
-    if not applies(errors):
+    if not applies(best.errors):
         return Bound.none(REASON)
-    found = BranchAndBound(errors, box).certify(value)
-    return replace(found, value=errors.unit * found.value)
+    found = BranchAndBound(best.errors, box).certify(best.value)
+    return replace(found, value=best.errors.unit * found.value)

@@ -1,21 +1,21 @@
 """A record as the errors of processes need it: its instants, its units, and what it cannot tell refused by name."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array, check_integer, one_of
-from optid.bases import Basis, Linear, fitted_bases
+from optid.arrays import one_of
+from optid.bases import Linear, fitted_bases
+from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import DataError, StructureError
 from optid.identify.arguments import check_offset, outputs_in_memory
-from optid.identify.process.errors import ProcessErrors, ProcessUnknowns
-from optid.identify.process.outputs import OutputErrors
+from optid.identify.process.errors import ProcessErrors
+from optid.identify.process.unknowns import ProcessUnknowns
 from optid.models.process import HOLDS
-from optid.models.process_dynamics import ProcessStructure, read_structures
+from optid.models.process_dynamics import read_structures
 from optid.program.units import in_units, inner_bases, own_units
 
 INITIAL = ("rest", "free")
@@ -38,12 +38,7 @@ class Terms:
             raise StructureError(f"drift must be True or False; got {self.drift!r}")
 
 
-def process_type(poles: int, zero: bool, delay: bool, integrator: bool) -> ProcessStructure:
-    """Return a type with real poles (`StructureError`: there is none)."""
-    return ProcessStructure(check_integer(poles, "poles", 0), False, bool(zero), bool(delay), bool(integrator))
-
-
-def process_errors(data: Data, process: Any, basis: Any, terms: Terms) -> OutputErrors:
+def process_errors(data: Data, process: Any, basis: Any, terms: Terms) -> ProcessErrors:
     """Check the arguments of a fit, and return its errors on the record in units of their own.
 
     Arguments and errors as of `formulations.process.process`.
@@ -56,26 +51,18 @@ def process_errors(data: Data, process: Any, basis: Any, terms: Terms) -> Output
     instants = tuple(np.arange(float(e.n_samples)) if e.stamps is None else e.stamps / data.dt
                      for e in data.experiments)
     refuse_still_inputs(data)
-    bases, each = fitted_bases(data, basis), []
-    for output, row in zip(data.outputs, rows):
-        there = [c for c, structure in enumerate(row) if structure is not None]
-        one = data.select(inputs=[data.inputs[c] for c in there], outputs=output)
-        each.append(_of_output(one, [row[c] for c in there], [bases[c] for c in there], replace(terms, initial=(
-            "free" if free else "rest")), instants))
-    return OutputErrors(data, tuple(each))
-
-
-def _of_output(data: Data, structures: Sequence[Any], bases: Sequence[Basis], terms: Terms,
-               instants: tuple[Array, ...]) -> ProcessErrors:
-    """Return the errors of one output, of the inputs that have a process to it."""
-    constants, free = check_offset(terms.offset, data), terms.initial == "free"
-    linear = [isinstance(one, Linear) for one in bases]
-    if terms.hold == "first" and not all(linear):
+    bases, constants = fitted_bases(data, basis), check_offset(terms.offset, data)
+    lines = [isinstance(one, Linear) for one in bases]
+    if terms.hold == "first" and not all(lines):
         raise StructureError("hold='first' is exact for straight static curves only: use hold='zero' with a basis")
-    units = replace(own_units(data, linear, bool(constants)), u_offset=(0.0,) * data.m)
+    own = [own_units(data.select(outputs=name), lines, bool(constants)) for name in data.outputs]
+    units = Transform(own[0].u_scale, (0.0,) * data.m, tuple(one.y_scale[0] for one in own),
+                      tuple(one.y_offset[0] for one in own))
     inner = tuple(inner_bases(bases, units))
-    unknowns = ProcessUnknowns(tuple(structures), tuple(one.size for one in inner), data.n_experiments,
-                               constants is True, bool(terms.drift), free, constants == "each")
+    there = [(o, c, one) for o, row in enumerate(rows) for c, one in enumerate(row) if one is not None]
+    unknowns = ProcessUnknowns(
+        tuple((o, c) for o, c, _ in there), tuple(one for *_, one in there), tuple(inner[c].size for _, c, _ in there),
+        data.n_experiments, constants is True, bool(terms.drift), free, constants == "each")
     return ProcessErrors(in_units(data, units), unknowns, inner, units, instants, terms.hold == "first")
 
 

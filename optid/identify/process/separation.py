@@ -8,7 +8,6 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import DataWarning, RankError
 from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells
-from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.starts import usual_box
 from optid.phrases import p_equals
 
@@ -17,70 +16,68 @@ MOVING, EXACT = 1e-4, 1e-12  # p value, and share of the energy of the output, b
 NEAR = 0.02  # of a logarithm from its bound that counts as none
 MANYFOLD = 3.0  # standard error of a logarithm from which on a time constant is not determined
 SHARE = 0.1  # of a direction from which on a parameter takes part in it
+TAUS = ("tau1", "tau2", "tau3")  # of which several may be equal
 ALIKE = 1e-7  # singular value of the scaled derivatives, relative to the largest, at which parameters are not separable
 
 
-def refuse_silence(errors: ProcessErrors, best: ProcessPoint) -> None:
+def refuse_silence(best: ProcessPoint) -> None:
     """Refuse a record in which the output shows no response to any input (`RankError`)."""
-    from scipy.stats import f as fisher
-
-    u = errors.unknowns
-    still = best.columns[:, sum(u.sizes) :]
+    errors, u = best.errors, best.errors.unknowns
+    still, used = best.columns[:, sum(u.sizes) :], len(u.dynamic) + sum(u.sizes)
     rest = errors.y - still @ np.linalg.lstsq(still, errors.y, rcond=None)[0] if still.shape[1] else errors.y
-    used, dof = len(u.dynamic) + sum(u.sizes), len(errors.y) - u.size
     before = float(rest @ rest)
-    ratio = (before - best.value) / used / max(best.value / dof, 1e-300)
-    if fisher.sf(ratio, used, dof) < CHANCE:
+    p = _chance(before - best.value, used, best.value, len(errors.y) - u.size)
+    if p < CHANCE:
         return
     level = errors.units.y_offset[0] + errors.units.y_scale[0] * float(np.mean(errors.y))
     size = errors.units.y_scale[0] * np.sqrt(before / len(errors.y))
     raise RankError(
-        f"output {errors.data.outputs[0]!r} shows no response to {', '.join(errors.data.inputs)} (p = "
-        f"{fisher.sf(ratio, used, dof):.2g}): the dead time may be longer than the record, or the gain small beside "
-        f"the noise. Determined is its level alone, {level:.4g} (standard deviation {size:.2g}). Use a longer record "
-        "or a larger step")
+        f"output {errors.data.outputs[0]!r} shows no response to {', '.join(_inputs(best))} (p = {p:.2g}): the dead "
+        f"time may be longer than the record, or the gain small beside the noise. Determined is its level alone, "
+        f"{level:.4g} (standard deviation {size:.2g}). Use a longer record or a larger step")
 
 
-def refuse_inseparable(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> None:
-    """Refuse time constants and dead times that the record shows only together (`RankError`)."""
-    u, at = errors.unknowns, errors.unknowns.dynamic
-    _refuse_instant(errors, box, best)
-    basis = np.linalg.qr(best.columns)[0]
-    slopes = _with_equal_ones_together(errors, best)
-    left = slopes - basis @ (basis.T @ slopes)
-    names = [errors.key(name, c) for c, one in enumerate(u.structures) for name in one.names]
-    sizes, box = np.linalg.norm(left, axis=0), usual_box(errors)
-    inner = (best.x[at] > box.low + 1e-9) & (best.x[at] < box.high - 1e-9)
-    whole = np.linalg.norm(slopes, axis=0)
-    silent = [name for name, size, much, free in zip(names, sizes, whole, inner)
-              if free and much > 0 and size <= ALIKE * much]
-    if silent:
-        raise RankError(f"{', '.join(silent)} {'have' if silent[1:] else 'has'} no effect on this record that the gain "
-                        f"does not have as well. {_determined(errors, best)}")
-    used = left[:, inner & (sizes > 0)] / sizes[inner & (sizes > 0)]
-    if used.shape[1] < 2:
-        return
-    values, vectors = np.linalg.svd(used, full_matrices=False)[1:]
-    if values[-1] > ALIKE * values[0]:
-        return
-    kept = [name for name, there in zip(names, inner & (sizes > 0)) if there]
-    parts = [name for name, part in zip(kept, np.abs(vectors[-1])) if part > SHARE]
-    raise RankError(f"{', '.join(parts)} can change together without any effect on this record: it does not separate "
-                    f"them. {_determined(errors, best)}")
-
-
-def warn_of_motion(errors: ProcessErrors, best: ProcessPoint) -> str:
-    """Warn where experiments do not begin at rest: a score test of motions of their own; return its finding or ""."""
+def _chance(gain: float, columns: int, rest: float, dof: int) -> float:
+    """Return the p value of the F test of so many columns that lower the sum of squares by a gain, to a rest."""
     from scipy.stats import f as fisher
 
-    u = errors.unknowns
+    return float(fisher.sf(gain / columns / max(rest / dof, 1e-300), columns, dof))
+
+
+def _inputs(best: ProcessPoint) -> list[str]:
+    return [best.errors.data.inputs[c] for _, c in best.errors.unknowns.pairs]
+
+
+def refuse_inseparable(best: ProcessPoint, box: ProcessBox) -> None:
+    """Refuse time constants and dead times that the record shows only together (`RankError`)."""
+    _refuse_instant(best, box)
+    slopes, names = _with_equal_ones_together(best), np.array(_names(best))
+    left, usual = best.without_linear(slopes), usual_box(best.errors)
+    inner = (best.numbers > usual.low + 1e-9) & (best.numbers < usual.high - 1e-9)
+    sizes, whole = np.linalg.norm(left, axis=0), np.linalg.norm(slopes, axis=0)
+    silent = names[inner & (whole > 0) & (sizes <= ALIKE * whole)]
+    if silent.size:
+        raise RankError(f"{', '.join(silent)} {'have' if silent.size > 1 else 'has'} no effect on this record that the "
+                        f"gain does not have as well. {_determined(best)}")
+    kept = inner & (sizes > 0)
+    if kept.sum() < 2:
+        return
+    values, vectors = np.linalg.svd(left[:, kept] / sizes[kept], full_matrices=False)[1:]
+    if values[-1] <= ALIKE * values[0]:
+        parts = names[kept][np.abs(vectors[-1]) > SHARE]
+        raise RankError(f"{', '.join(parts)} can change together without any effect on this record: it does not "
+                        f"separate them. {_determined(best)}")
+
+
+def warn_of_motion(best: ProcessPoint) -> str:
+    """Warn where experiments do not begin at rest: a score test of motions of their own; return its finding or ""."""
+    errors, u = best.errors, best.errors.unknowns
     if u.free:
         return ""
     free = replace(errors, unknowns=replace(u, free=True))
     x = np.concatenate([best.x[: u.shared], np.zeros(free.unknowns.size - u.shared)])
-    every = free.columns(x)
+    motions = free.columns(x)[:, len(u.linear) - u.n * u.experiments :]
     known = np.column_stack([best.columns, errors.slopes(best.x)])
-    motions = every[:, len(u.linear) - u.n * u.experiments :]
     basis = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))[0]
     left = motions - basis @ (basis.T @ motions)
     sizes = np.linalg.norm(left, axis=0)
@@ -88,114 +85,105 @@ def warn_of_motion(errors: ProcessErrors, best: ProcessPoint) -> str:
     dof = len(errors.y) - known.shape[1] - left.shape[1]
     if not left.shape[1] or dof < 1:
         return ""
-    gain = float(np.sum((np.linalg.qr(left)[0].T @ best.errors) ** 2))
-    p = float(fisher.sf(gain / left.shape[1] / max((best.value - gain) / dof, 1e-300), left.shape[1], dof))
+    gain = float(np.sum((np.linalg.qr(left)[0].T @ best.rest) ** 2))
+    p = _chance(gain, left.shape[1], best.value - gain, dof)
     if p >= MOVING or gain <= EXACT * errors.energy:
         return ""
-    found, of = f"not at rest ({p_equals(p, 1)})", errors.data.outputs[0]
-    warnings.warn(f"output {of!r} does not begin at rest under its first inputs ({p_equals(p, 1)}): initial='free' "
-                  "estimates a motion of its own for every experiment; gain and time constants are biased without it",
-                  DataWarning, stacklevel=2)
-    return found
+    warnings.warn(f"output {errors.data.outputs[0]!r} does not begin at rest under its first inputs "
+                  f"({p_equals(p, 1)}): initial='free' estimates a motion of its own for every experiment; gain and "
+                  "time constants are biased without it", DataWarning, stacklevel=2)
+    return f"not at rest ({p_equals(p, 1)})"
 
 
-def describe_bounds(errors: ProcessErrors, best: ProcessPoint) -> str:
+def describe_bounds(best: ProcessPoint) -> str:
     """Return which parameters lie at the smallest or largest value that is tried, and what that means; "" for none."""
-    box, found, j = usual_box(errors), [], 0
-    for c, one in enumerate(errors.processes(best.x)):
-        for name, value in zip(one.structure.names, one.in_unit(1 / errors.data.dt).p):
-            number = best.x[errors.unknowns.dynamic][j]
-            low, high = number <= box.low[j] + NEAR, number >= box.high[j] - NEAR
-            if name != "dead_time" and (low or high):
-                means = "fewer poles may do" if low else "the process may integrate (I in its type)"
-                size = f"{value:.4g} {errors.data.time_unit * (name != 'zeta')}".rstrip()
-                found.append(f"{errors.key(name, c)} at the {'smallest' if low else 'largest'} value that is tried, "
-                             f"{size}: {means if name not in ('zeta', 'tau_zero') else 'it is not determined'}")
-            j += 1
+    box, data, found = usual_box(best.errors), best.errors.data, []
+    values = np.concatenate([one.in_unit(1 / data.dt).p for one in best.errors.processes(best.x)])
+    for j, (p, name) in enumerate(best.errors.unknowns.numbers):
+        low, high = best.numbers[j] <= box.low[j] + NEAR, best.numbers[j] >= box.high[j] - NEAR
+        if name != "dead_time" and (low or high):
+            means = "fewer poles may do" if low else "the process may integrate (I in its type)"
+            size = f"{values[j]:.4g} {data.time_unit * (name != 'zeta')}".rstrip()
+            found.append(f"{best.errors.key(name, p)} at the {'smallest' if low else 'largest'} value that is tried, "
+                         f"{size}: {means if name not in ('zeta', 'tau_zero') else 'it is not determined'}")
     return "; ".join(found)
 
 
-def describe_flatness(errors: ProcessErrors, best: ProcessPoint) -> str:
+def describe_flatness(best: ProcessPoint) -> str:
     """Return which parameters may change manyfold, together, without an effect beyond the noise; "" for none.
 
     Those at a bound are not among them: see `describe_bounds`.
     """
-    box, at = usual_box(errors), errors.unknowns.dynamic
-    basis = np.linalg.qr(best.columns)[0]
-    slopes = _with_equal_ones_together(errors, best)
-    slopes = slopes - basis @ (basis.T @ slopes)
-    names = [errors.key(name, c) for c, one in enumerate(errors.unknowns.structures) for name in one.names]
-    logs = np.concatenate([one.logarithmic for one in errors.unknowns.structures])
+    box, logs = usual_box(best.errors), best.errors.unknowns.logarithmic
+    slopes = best.without_linear(_with_equal_ones_together(best))
     sizes, gap = np.linalg.norm(slopes, axis=0), np.where(logs, NEAR, 1e-9)
-    free = np.flatnonzero((best.x[at] > box.low + gap) & (best.x[at] < box.high - gap) & (sizes > 0))
+    free = np.flatnonzero((best.numbers > box.low + gap) & (best.numbers < box.high - gap) & (sizes > 0))
     if len(free) < 1:
         return ""
-    noise = np.sqrt(best.value / max(len(errors.y) - errors.unknowns.size, 1))
     values, vectors = np.linalg.svd(slopes[:, free] / sizes[free], full_matrices=False)[1:]
     # by how much the noise lets every number change in the direction that the record shows least
-    moves = np.abs(vectors[-1]) * noise / sizes[free] / max(values[-1], 1e-300)
-    loose = moves > np.where(logs[free], MANYFOLD, errors.length)
-    if not loose.any():
+    moves = np.abs(vectors[-1]) * best.noise / sizes[free] / max(values[-1], 1e-300)
+    if not np.any(moves > np.where(logs[free], MANYFOLD, best.errors.length)):
         return ""
-    found = [names[free[i]] for i in np.flatnonzero(np.abs(vectors[-1]) > SHARE)]
-    return (f"{', '.join(found)}: {'together they' if found[1:] else 'it'} may change manyfold without visible effect; "
-            "a simpler type may do")
+    found = np.array(_names(best))[free[np.abs(vectors[-1]) > SHARE]]
+    return (f"{', '.join(found)}: {'together they' if found.size > 1 else 'it'} may change manyfold without visible "
+            "effect; a simpler type may do")
 
 
-def _with_equal_ones_together(errors: ProcessErrors, best: ProcessPoint) -> Array:
+def _names(best: ProcessPoint) -> list[str]:
+    return [best.errors.key(name, p) for p, name in best.errors.unknowns.numbers]
+
+
+def _with_equal_ones_together(best: ProcessPoint) -> Array:
     """Return the derivatives by all numbers; of equal time constants the first has those of all, the others none."""
-    slopes, place = errors.slopes(best.x), 0
-    for c, one in enumerate(errors.unknowns.structures):
-        logs = best.x[errors.unknowns.slices[f"dynamics{c}"]][: one.real]
-        for i in range(1, one.real):
-            for j in range(i):
-                if logs[i] == logs[j] and slopes[:, place + i].any():
-                    slopes[:, place + j] += slopes[:, place + i]
-                    slopes[:, place + i] = 0.0
-        place += len(one.names)
+    slopes, numbers = best.errors.slopes(best.x), best.errors.unknowns.numbers
+    for i, (p, name) in enumerate(numbers):
+        for j in range(i):
+            same = numbers[j][0] == p and {name, numbers[j][1]} <= set(TAUS) and best.numbers[i] == best.numbers[j]
+            if same and slopes[:, i].any():
+                slopes[:, j] += slopes[:, i]
+                slopes[:, i] = 0.0
     return slopes
 
 
-def describe_equal_ones(errors: ProcessErrors, best: ProcessPoint) -> str:
+def describe_equal_ones(best: ProcessPoint) -> str:
     """Return which time constants coincide, and what that means; "" for none."""
-    found = []
-    for c, one in enumerate(errors.unknowns.structures):
-        logs = best.x[errors.unknowns.slices[f"dynamics{c}"]][: one.real]
+    found, u = [], best.errors.unknowns
+    for p, (one, name) in enumerate(zip(u.structures, _inputs(best))):
+        logs = best.x[u.slices[f"dynamics{p}"]][: one.real]
         if len(set(logs.tolist())) < len(logs):
-            found.append(f"equal{'' if errors.data.m == 1 else f' ({errors.data.inputs[c]})'}: the record asks for a "
-                         "complex pair (U in the type), or for fewer poles")
+            found.append(f"equal{f' ({name})' * (len(u.pairs) > 1)}: the record asks for a complex pair (U in the "
+                         "type), or for fewer poles")
     return "; ".join(found)
 
 
-def _refuse_instant(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> None:
+def _refuse_instant(best: ProcessPoint, box: ProcessBox) -> None:
     """Refuse a time constant below a sampling time that is not told from zero beside a dead time (`RankError`)."""
     from scipy.stats import f as fisher
 
-    dof = len(errors.y) - errors.unknowns.size
-    for c, one in enumerate(errors.unknowns.structures):
-        first = errors.unknowns.slices[f"dynamics{c}"].start
-        place = errors.place(c) - len(one.names) + 1
-        if one.names != ("tau", "dead_time") or best.x[first] > 0 or box.low[place] == box.high[place]:
+    dof = len(best.rest) - len(best.x)
+    for p, late in best.errors.unknowns.delays.items():
+        place = late - 1
+        if best.errors.unknowns.structures[p].names != ("tau", "dead_time") or best.numbers[place] > 0 or (
+                box.low[place] == box.high[place]):
             continue
-        x = best.x.copy()
-        x[first + 1] += np.exp(best.x[first])
-        x[first] = box.low[place]
+        moved = best.numbers.copy()
+        moved[late] += np.exp(moved[place])
         held = box.within(place, box.low[place], box.low[place])
-        found = search_cells(errors, descend(errors, x, held)[0], held)
+        found = search_cells(descend(best.errors, best.at(moved).x, held)[0], held)
         if found.value <= best.value * (1 + fisher.ppf(0.95, 1, dof) / dof):
-            name = errors.key("tau", c)
+            name, other = (best.errors.key(word, p) for word in ("tau", "dead_time"))
             raise RankError(f"{name} lies below a sampling time and is not told from zero: it does not separate from "
-                            f"{errors.key('dead_time', c)}. {_determined(errors, best)}")
+                            f"{other}. {_determined(best)}")
 
 
-def _determined(errors: ProcessErrors, best: ProcessPoint) -> str:
+def _determined(best: ProcessPoint) -> str:
     """Say which sum of times the record determines all the same, and what to do."""
-    found = []
-    for c, one in enumerate(errors.processes(best.x)):
-        lag = one.in_unit(1 / errors.data.dt)
+    found, data = [], best.errors.data
+    for name, one in zip(_inputs(best), best.errors.processes(best.x)):
+        lag = one.in_unit(1 / data.dt)
         total = lag.p[: one.structure.real].sum() + 2 * lag.value("zeta") * lag.value("T") + lag.dead_time
-        of = f" ({errors.data.inputs[c]})" if errors.data.m > 1 else ""
-        found.append(f"{total - lag.value('tau_zero'):.4g}{of}")
-    sums = f"{', '.join(found)} {errors.data.time_unit}".rstrip()
+        found.append(f"{total - lag.value('tau_zero'):.4g}{f' ({name})' * (data.m > 1)}")
+    sums = f"{', '.join(found)} {data.time_unit}".rstrip()
     return (f"Determined is their sum, the mean delay of the response: {sums}. Sample faster, choose fewer poles, or "
             "hold one by a constraint such as dead_time:0")

@@ -1,7 +1,7 @@
-"""Starts of descents: a coarse grid over one time scale, the damping, the zero and the dead time of every input.
+"""Starts of descents: a coarse grid over one time scale, the damping, the zero and the dead time of every pair.
 
 For every point of the grid the response gives a Gram matrix with the output and the columns that do not move; the sum
-of squares follows from it. Responses to all dead times are run by one kernel.
+of squares follows from it.
 """
 
 from collections.abc import Iterator
@@ -13,9 +13,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.identify.process.descent import ProcessBox, ProcessPoint, descend
 from optid.identify.process.errors import ProcessErrors
-from optid.kernel_cache import cached_njit
 from optid.models.process_dynamics import ProcessDynamics, ProcessStructure
-from optid.models.process_kernel import run
 
 SCALES, DELAYS = 12, 24  # time scales and dead times of the grid
 FASTEST = 0.05  # samples of the smallest time constant
@@ -26,50 +24,19 @@ APART = 0.06  # share of the bounds in which two starts that are both kept diffe
 KEPT = 4  # starts that descend
 
 
-@cached_njit
-def gram_matrices(F, C, instants, course, thetas, still, settings):  # noqa: N803
-    """Return the Gram matrices (D, M + s, M + s) of [responses, still columns] for all dead times (D,).
-
-    The course are the times (J,) and values (J, M) of the input. The still columns (N, s) end with the output; the
-    first M rows of `settings` (M + 1,) are what is added to every response, the last says whether the input goes
-    straight.
-    """
-    changes, inputs = course
-    m, s = inputs.shape[1], still.shape[1]
-    found = np.zeros((len(thetas), m + s, m + s))
-    row, later, start = np.zeros(m + s), np.zeros(len(changes)), np.zeros((len(F), m))
-    for i in range(len(thetas)):
-        for j in range(len(changes)):
-            later[j] = changes[j] + thetas[i]
-        sides = settings[m] > 0.0, settings[m] >= 0.0  # a literal True would have the kernel compiled once more
-        response = run(F, C, instants, later, inputs, sides, start)
-        for k in range(len(instants)):
-            for c in range(m):
-                row[c] = response[k, 0, c] + settings[c]
-            for c in range(s):
-                row[m + c] = still[k, c]
-            for a in range(m + s):
-                for b in range(m + s):
-                    found[i, a, b] += row[a] * row[b]
-    return found
-
-
 def usual_box(errors: ProcessErrors) -> ProcessBox:
     """Return usual bounds: time constants from a twentieth of a sample to ten records, and dead times.
 
     These leave at least a quarter of what follows the first change of the input.
     """
-    low, high, span = [], [], errors.length
-    for c, structure in enumerate(errors.unknowns.structures):
-        after = max((float(t[-1] - drives[c].changes[1]) for t, drives in zip(errors.instants, errors.drives)
-                     if len(drives[c].changes) > 1), default=0.0)
-        ends = {"zeta": (np.log(0.02), np.log(20.0)), "tau_zero": (-3 * span, 3 * span),
-                "dead_time": (0.0, 0.75 * after)}
-        for name in structure.names:
-            one = ends.get(name, (np.log(FASTEST), np.log(10 * span)))
-            low.append(one[0])
-            high.append(one[1])
-    return ProcessBox(np.array(low), np.array(high))
+    span, ends = errors.length, []
+    for p, name in errors.unknowns.numbers:
+        after = max((float(errors.instants[course.experiment][-1] - drive.changes[1])
+                     for course, drive in errors.courses_of(p) if len(drive.changes) > 1), default=0.0)
+        ends.append({"zeta": (np.log(0.02), np.log(20.0)), "tau_zero": (-3 * span, 3 * span),
+                     "dead_time": (0.0, 0.75 * after)}.get(name, (np.log(FASTEST), np.log(10 * span))))
+    low, high = np.array(ends, dtype=float).T
+    return ProcessBox(low, high)
 
 
 def grid(structure: ProcessStructure, low: Array, high: Array) -> Iterator[Array]:
@@ -86,24 +53,22 @@ def grid(structure: ProcessStructure, low: Array, high: Array) -> Iterator[Array
         yield np.clip([value.get(name, 0.0) for name in structure.names], low, high)
 
 
-def scan(errors: ProcessErrors, c: int, box: ProcessBox, others: Array) -> list[tuple[float, Array]]:
-    """Return (sum of squares, numbers) of input c on the grid, the best first, beside columns (rows, s) of others."""
-    structure, first = errors.unknowns.structures[c], sum(len(s.names) for s in errors.unknowns.structures[:c])
-    part = slice(first, first + len(structure.names))
-    low, high = box.low[part], box.high[part]
+def scan(errors: ProcessErrors, p: int, box: ProcessBox, others: Array) -> list[tuple[float, Array]]:
+    """Return (sum of squares, numbers) of a pair on the grid, the best first, beside columns (rows, s) of others."""
+    structure, mine = errors.unknowns.structures[p], [pair == p for pair, _ in errors.unknowns.numbers]
+    low, high = box.low[mine], box.high[mine]
     thetas = np.unique(np.linspace(low[-1], high[-1], DELAYS)) if structure.delay else np.zeros(1)
-    still, found = np.column_stack([others, errors.y]), []
-    m = errors.unknowns.sizes[c]
+    found, m = [], errors.unknowns.sizes[p]
+    columns = np.empty((len(thetas), len(errors.y), m + others.shape[1] + 1))
+    columns[:, :, m:] = np.column_stack([others, errors.y])
     for numbers in grid(structure, low, high):
-        f, row = ProcessDynamics(structure, structure.parameters(numbers)).plain
-        total = np.zeros((len(thetas), m + still.shape[1], m + still.shape[1]))
-        for t, drives, span in zip(errors.read_at, errors.drives, errors.spans):
-            drive = drives[c]
-            level = np.zeros(m) if structure.integrator else drive.values[0]
-            settings = np.append(level, float(errors.straight))
-            course = drive.changes, np.ascontiguousarray(drive.about_rest)
-            total += gram_matrices(f, row, t, course, thetas, np.ascontiguousarray(still[span]), settings)
-        for theta, value in zip(thetas, _least(total)):
+        one = ProcessDynamics(structure, structure.parameters(numbers))
+        for course, drive in errors.courses_of(p):
+            level, rest = np.zeros(m) if structure.integrator else drive.values[0], drive.about_rest
+            for i, theta in enumerate(thetas):  # a dead time moves the instants at which the undelayed course is read
+                columns[i, course.span, :m] = level + one.response(
+                    course.instants - theta + one.dead_time, drive.changes, rest, straight=errors.straight)[:, 0]
+        for theta, value in zip(thetas, _least(np.swapaxes(columns, 1, 2) @ columns)):
             point = numbers.copy()
             if structure.delay:
                 point[-1] = theta
@@ -123,37 +88,24 @@ def _least(grams: Array) -> Array:
 
 def starts(errors: ProcessErrors, box: ProcessBox) -> list[Array]:
     """Return different unknowns to start from, the best first; with several inputs one after another is scanned."""
-    u, x = errors.unknowns, np.zeros(errors.unknowns.size)
-    at, m = u.dynamic, errors.data.m
-    x[at] = (box.low + np.maximum(np.minimum(box.high, box.low + 4), box.low)) / 2
-    constant = np.ones((len(errors.y), 1))[:, : int(u.constant or u.levels)]
-    done: dict[int, Array] = {}
+    u, x, pairs = errors.unknowns, np.zeros(errors.unknowns.size), range(len(errors.unknowns.pairs))
+    x[u.dynamic] = (box.low + np.maximum(np.minimum(box.high, box.low + 4), box.low)) / 2
+    constant, width = np.ones((len(errors.y), int(u.constant or u.levels))), np.maximum(box.high - box.low, 1e-300)
+    done: list[int] = []
     chosen: list[Array] = []
-    for _ in range(1 if m == 1 else 2):
-        for c in range(m):
-            others: list[Array] = [constant]
-            for i, numbers in done.items():
-                if i != c:
-                    x[u.slices[f"dynamics{i}"]] = numbers
-            whole = errors.columns(x) if done else constant
-            position = 0
-            for i in range(m):
-                if i in done and i != c:
-                    others.append(whole[:, position : position + u.sizes[i]])
-                position += u.sizes[i]
-            ranked = scan(errors, c, box, np.column_stack(others))
-            done[c] = ranked[0][1]
-            chosen = []
-            for _, numbers in ranked:
-                point = x.copy()
-                for i, best in done.items():
-                    point[u.slices[f"dynamics{i}"]] = best
-                point[u.slices[f"dynamics{c}"]] = numbers
-                width = np.maximum(box.high - box.low, 1e-300)
-                if all(np.max(np.abs(point[at] - one[at]) / width) > APART for one in chosen):
-                    chosen.append(point)
-                if len(chosen) == KEPT:
-                    break
+    for p in (*pairs, *pairs) if len(pairs) > 1 else pairs:
+        mus = [np.arange(u.size)[u.slices[f"mu{q}"]] for q in done if q != p]
+        beside = errors.columns(x)[:, np.isin(u.linear, np.concatenate(mus))] if mus else constant[:, :0]
+        ranked = scan(errors, p, box, np.hstack([constant, beside]))
+        done, chosen = [*done, p], []
+        for _, numbers in ranked:
+            point = x.copy()
+            point[u.slices[f"dynamics{p}"]] = numbers
+            if all(np.max(np.abs(point - one)[u.dynamic] / width) > APART for one in chosen):
+                chosen.append(point)
+            if len(chosen) == KEPT:
+                break
+        x = chosen[0].copy()
     return chosen
 
 
@@ -162,23 +114,22 @@ def simpler(errors: ProcessErrors, box: ProcessBox) -> list[Array]:
 
     A richer type then fits no worse: the poles that it adds are the fastest that are tried.
     """
-    structures = errors.unknowns.structures
-    fewer = tuple(replace(one, real=min(one.real + 2 * one.pair, 1), pair=False, zero=False) for one in structures)
-    if fewer == structures:
+    u, fast, found = errors.unknowns, 2 * FASTEST, []
+    fewer = tuple(replace(one, real=min(one.real + 2 * one.pair, 1), pair=False, zero=False) for one in u.structures)
+    if fewer == u.structures:
         return []
-    plain = replace(errors, unknowns=replace(errors.unknowns, structures=fewer))
+    plain = replace(errors, unknowns=replace(u, structures=fewer))
     inner = usual_box(plain)
-    found = []
     for point in (descend(plain, x, inner, steps=30, tolerance=1e-7)[0] for x in starts(plain, inner)[:2]):
-        x = np.zeros(errors.unknowns.size)
-        for c, (one, less, process) in enumerate(zip(structures, fewer, plain.processes(point.x))):
-            fast, tau = 2 * FASTEST, process.value("tau")
+        x = np.zeros(u.size)
+        for p, (one, less, process) in enumerate(zip(u.structures, fewer, plain.processes(point.x))):
+            tau = process.value("tau")
             pair = (tau, fast) if not one.real else (fast, fast)
             value = {"tau": tau, "tau1": tau, "tau2": fast, "tau3": fast, "T": np.sqrt(np.prod(pair)),
                      "zeta": sum(pair) / 2 / np.sqrt(np.prod(pair)), "tau_zero": 0.0,
                      "dead_time": max(process.dead_time - fast * (one.order - less.order), 0.0)}
-            x[errors.unknowns.slices[f"dynamics{c}"]] = one.numbers(np.array([value[name] for name in one.names]))
-        x[errors.unknowns.dynamic] = np.clip(x[errors.unknowns.dynamic], box.low, box.high)
+            x[u.slices[f"dynamics{p}"]] = one.numbers(np.array([value[name] for name in one.names]))
+        x[u.dynamic] = box.clip(x[u.dynamic])
         found.append(x)
     return found
 
@@ -190,8 +141,7 @@ def best_descents(errors: ProcessErrors, box: ProcessBox) -> list[ProcessPoint]:
                    for x in (*starts(coarse, box), *simpler(coarse, box))), key=lambda one: one.value)
     kept: list[ProcessPoint] = []
     for end in ends:
-        if end.value <= 3 * ends[0].value and all(
-                np.max(np.abs(end.x - one.x)[errors.unknowns.dynamic]) > 0.05 for one in kept):
+        if end.value <= 3 * ends[0].value and all(np.max(np.abs(end.numbers - one.numbers)) > 0.05 for one in kept):
             kept.append(end)
     found = [descend(errors, one.x, box)[0] for one in kept[: 2 if coarse is not errors else 3]]
     return sorted(found, key=lambda one: one.value)

@@ -18,6 +18,8 @@ from optid.identify.blocks import Blocks
 from optid.identify.informativity import Informativity, Process, informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.levels import LevelEvidence, level_evidence
+from optid.identify.process.order import choose_types
+from optid.identify.process.record import Terms, process_errors
 from optid.identify.search.determined import determined_bases
 from optid.identify.search.trial import CLEAR, FEEDBACK, INPUTS, KINDS, LATENT, LINEAR, StructureCandidate, Trial, near
 
@@ -64,6 +66,8 @@ class Ladder:
     def of(cls, blocks: Blocks, several: bool = False) -> "Ladder":
         """Look for delays and orders of autoregressions in the sums of the record, and for levels of several runs."""
         data, told = blocks.data, informativity(blocks.data)
+        if not data.is_regular:  # no lags can be compared
+            return cls(data, len(blocks.moving), told, [], [], {})
         sums = LagSums(blocks, linear(data))
         delays = [(told.least,) * data.m]
         if told.processes:
@@ -91,7 +95,8 @@ class Ladder:
     @property
     def few_moves(self) -> bool:
         """Whether an input moves so rarely, or the record tells so little, that only low orders can be told apart."""
-        return bool(self.told.reason) or (bool(self.told.processes) and self.told.moves < FEW_MOVES)
+        told = bool(self.told.processes) or not self.data.is_regular
+        return bool(self.told.reason) or (told and self.told.moves < FEW_MOVES)
 
     @property
     def open(self) -> bool:
@@ -171,6 +176,9 @@ def climbed(candidates: Iterable[list[StructureCandidate]]) -> Rung:
 def linear_models(ladder: Ladder) -> Rung:
     """The low-order model found in the record, autoregressions, subspace and output-error models, and refinements."""
     model = partial(structure, LINEAR)
+    if not ladder.data.is_regular:
+        yield [processes_by_criterion(ladder, LINEAR)]
+        return
     if ladder.single and ladder.told.processes:
         if ladder.few_moves and ladder.open:
             found = yield list(process_models(ladder))
@@ -199,6 +207,17 @@ def linear_models(ladder: Ladder) -> Rung:
     if a := ladder.arguments(LINEAR, "oe.exact"):
         yield [model("bj.exact", na=n, nb=a["nb"], nk=a["nk"], nc=1, nd=1)
                for n in dict.fromkeys([max(a["na"] - 1, 1), a["na"], a["na"] + 1])]
+
+
+def processes_by_criterion(ladder: Ladder, kind: str, basis: Any = "linear") -> StructureCandidate:
+    """Return processes of the types that the Bayesian information criterion chooses for all pairs.
+
+    The errors raised are those of `choose_types`.
+    """
+    errors = choose_types(process_errors(ladder.data, "P1D", basis, Terms(initial="free")))[0]
+    words = [one.word for one in errors.unknowns.structures]
+    curve = {} if isinstance(basis, str) and basis == "linear" else {"basis": basis}
+    return structure(kind, "process.exact", process=words, initial="free", **curve)
 
 
 def process_models(ladder: Ladder) -> Iterator[StructureCandidate]:
@@ -253,6 +272,9 @@ def _in_a_loop(ladder: Ladder) -> Rung:
 def input_functions(ladder: Ladder) -> Rung:
     """Static functions of the inputs before linear dynamics."""
     words = [ladder.bases(word) for word in ("polynomial:3", "triangular:6")]
+    if not ladder.data.is_regular:
+        yield [processes_by_criterion(ladder, INPUTS, word) for word in words]
+        return
     if not ladder.single:
         yield from _of_several_outputs(ladder, words)
         return

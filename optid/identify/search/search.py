@@ -116,6 +116,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     nor one with feedback or functions of latent signals that leaves the range of the outputs by half of it when the
     inputs come in other orders. The trials, and with them the model, depend on the record and the arguments alone, not
     on the machine or the number of processes. An interrupt (Ctrl-C) ends the search with the best so far.
+    At irregular times processes in continuous time are all that is tried.
 
     Args:
         data: the record.
@@ -143,7 +144,6 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     clock = time.monotonic()
     if not isinstance(data, Data):
         raise DataError(f"{not_a_record(data, 'identify')} A search fits a record many times, in memory.")
-    data.refuse_irregular("a search")
     most = effort_of(effort)
     if budget is not None and (not is_number(budget) or not budget > 0 or LARGEST < budget < np.inf):
         raise StructureError(f"budget must be a positive number of seconds; got {shown(budget)}")
@@ -213,7 +213,11 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
 def _limits(ladder: Ladder) -> Iterator[tuple[str, str]]:
     """Yield the classes that the record cannot tell from others, with the reason."""
     kinds, reason = KINDS[1:], ""
-    if ladder.told.reason:
+    if not ladder.data.is_regular:
+        kinds = kinds if ladder.few_moves else (FEEDBACK, LATENT)
+        reason = ("samples at irregular times: only processes in continuous time were compared (where rows were lost, "
+                  "read the record with --gaps missing)")
+    elif ladder.told.reason:
         reason = "nothing can be identified from this record: only the simplest model was fitted"
     elif ladder.few_moves:
         moves = ladder.told.moves

@@ -162,12 +162,14 @@ def _residual_tests(model: Any, data: Data, residuals: Sequence[Array], lags: in
                    ) -> dict[str, dict[Any, Correlation]]:
     """Test the residuals (N, l) of every experiment: each with its past, with every input and with the others' past.
 
+    Lags count samples, at irregular times too: errors that are independent are so in the order of the samples.
+
     Dependence on an input is negligible where it is small beside the response: see `SLIGHT`.
     """
     columns = {name: [r[:, o] for r in residuals] for o, name in enumerate(data.outputs)}
     inputs = {name: [e.u[:, c] for e in data.experiments] for c, name in enumerate(data.inputs)}
     claimed, slight = describes_noise(model), {}
-    least = informativity(data).least if data.is_regular else 0
+    least = informativity(data).least
     for o, (name, errors) in enumerate(columns.items()):
         explained = np.nanstd(np.concatenate([e.y[:, o] - r for e, r in zip(data.experiments, errors)]))
         slight[name] = SLIGHT * float(explained / max(float(np.nanstd(np.concatenate(errors))), 1e-300))
@@ -185,9 +187,9 @@ def _residual_tests(model: Any, data: Data, residuals: Sequence[Array], lags: in
 def describes_noise(model: Any) -> bool:
     """Whether a model says anything about the colour of the noise: an output error says that it is white, and no more.
 
-    Its residuals may have any colour without making the response wrong.
+    Its residuals may have any colour without making the response wrong; nor do those of a process.
     """
-    if getattr(model, "structure", "") == "oe":
+    if getattr(model, "structure", "") in ("oe", "process"):
         return False
     return not hasattr(model, "K") or model.noise is not None or bool(np.any(model.K))
 
@@ -239,9 +241,6 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
     if not beyond and not static_functions(model):
         return None
     notes = [] if notes is None else notes
-    if not data.is_regular:
-        notes.append(f"{NOT_TESTED}the samples were taken at irregular times.")
-        return None
     known = informativity(data)
     runs = simulated_or_nan(model, data) if beyond else None
     reason = known.reason or known.untested

@@ -15,10 +15,13 @@ from optid.data.record import Data
 from optid.identify.informativity import Informativity
 from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
 from optid.identify.informativity.signals import RecordSignals, delayed, held, respond
+from optid.models.process_dynamics import ProcessDynamics, ProcessStructure
 
 LEVEL = 1e-3
 TAUS = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0)  # time constants of the bank, in samples
 LAGS = 2  # samples of a response behind the poles of the record
+FADING = (0.01, *np.geomspace(0.2, 300, 25))  # time constants of noise at irregular times, in mean sampling times
+FIRST_ORDER = ProcessStructure(1, delay=False)
 ROWS = 8  # samples per column, at least
 
 
@@ -66,7 +69,10 @@ def _measured(raw: Data, errors: list[Array], runs: list[Array], told: Informati
     y = [held(e[: len(y)][:, None]) for e, y in zip(errors[:kept], whole.y)]
     signals = replace(whole, y=tuple(y), present=tuple(present))
     rows = sum(int(there.sum()) for there in present)
-    columns = [_columns(u, whole, told, o) for u in whole.u]
+    times = [np.arange(float(len(u))) if e.stamps is None else e.stamps[: len(u)] / raw.dt
+             for e, u in zip((e for e in raw.experiments if e.n_samples > 1), whole.u)]
+    columns = [_columns(u, whole, told, o) if raw.is_regular else _columns_in_time(u, whole, t)
+               for u, t in zip(whole.u, times)]
     most = max(rows // ROWS, 1)
     columns = [c[:, :most] for c in columns]
     na = memory(signals, 0) + 1
@@ -77,7 +83,8 @@ def _measured(raw: Data, errors: list[Array], runs: list[Array], told: Informati
     if not parts or len(parts[2]) < parts[0].shape[1] + 2 * parts[1].shape[1]:
         return None
     past, inputs, error = parts
-    p_value = added(error, past, inputs).p_value
+    p_value = added(error, past, inputs).p_value if raw.is_regular else added(*_white_in_time([
+        (e[here], c[here[:, 0]], t[here[:, 0]]) for e, c, t, here in zip(y, columns, times, present)])).p_value
     alone = added(error, np.ones((len(error), 1)), inputs)
     rest = float(np.var(error))
     spare = max(len(error) - 1 - alone.columns, 1)
@@ -100,3 +107,33 @@ def _columns(u: Array, signals: RecordSignals, told: Informativity, o: int) -> A
             more += [delayed(respond((float(np.exp(-1 / tau)) if tau else 0.0,), x), late)
                      for tau in TAUS for late in sorted({told.least, max(lag, told.least)})]
     return np.column_stack([*first, *more])
+
+
+def _columns_in_time(u: Array, signals: RecordSignals, t: Array) -> Array:
+    """Return the inputs behind the bank at irregular times (N,), in mean sampling times; the responses are exact."""
+    found = [x for c in range(u.shape[1]) for x in powers(u[:, c], signals.levels(c))]
+    whole = np.column_stack(found)
+    bank = (ProcessDynamics(FIRST_ORDER, np.array([tau])) for tau in TAUS if tau)
+    return np.hstack([whole, *(one.response(t, t, whole - whole[0])[:, 0] for one in bank)])
+
+
+def _white_in_time(rows: Sequence[tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
+    """Return errors (N,), a constant (N, 1) and columns (N, k) at irregular times, filtered so that the noise is white.
+
+    Its correlation over a time h is taken to be exp(-h / tau), at the most likely tau: in the order of the samples the
+    past says too little, and inputs would seem to explain what noise did before a gap.
+    """
+    def at_rate(tau: float) -> tuple[Array, float]:
+        found, cost = [], 0.0
+        for errors, columns, t in rows:
+            z = np.column_stack([errors, np.ones(len(errors)), columns])
+            a = np.exp(-np.diff(t) / tau)
+            size = np.sqrt(-np.expm1(-2 * np.diff(t) / tau))
+            found.append(np.vstack([z[:1], (z[1:] - a[:, None] * z[:-1]) / size[:, None]]))
+            cost += 2 * float(np.sum(np.log(size)))
+        whole = np.vstack(found)
+        rest = whole[:, 0] - whole[:, 1:2] @ np.linalg.lstsq(whole[:, 1:2], whole[:, 0])[0]
+        return whole, len(whole) * float(np.log(max(rest @ rest, 1e-300))) + cost
+
+    best = min((at_rate(tau) for tau in FADING), key=lambda one: one[1])[0]
+    return best[:, 0], best[:, 1:2], best[:, 2:]
