@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 from optid.cli.app import app
 from optid.errors import StudyError
 from optid.examples import example
-from optid.studies.definition.description import Study
 from optid.studies.execution.cell import lost_row
 from optid.studies.grid import cells
 from optid.studies.page import write_page
 from optid.studies.storage.store import append, read_rows
+from optid.studies.study import Study
 from optid.studies.verdicts.verdict import conclude
 
 SOLVERS = '["clarabel", "gauss_newton", "auto"]'
@@ -324,8 +324,8 @@ def test_compare_tells_an_error_of_the_record_once(folder):
     (("compare", "rig.csv", "-u", "curent", "-y", "thrust"), "Did you mean 'current'"),
     (("compare", "--example", "thrster"), "Did you mean 'thruster'"),
     (("compare", "--example", "thruster", "--solvers", "clarabell"), "Did you mean 'clarabel'"),
-    (("compare", "--example", "thruster", "--accuracy", 3), "--accuracy must be a number between 0 and 1"),
-    (("compare", "--example", "thruster", "--repetitions", 0), "--repetitions must be a positive integer"),
+    (("compare", "--example", "thruster", "--accuracy", 3), "--accuracy must be less than 1"),
+    (("compare", "--example", "thruster", "--repetitions", 0), "--repetitions must be greater than 0"),
     (("compare", "--example", "thruster", "-f", "hammerstein_arx.exat"), "Did you mean 'hammerstein_arx.exact'"),
     (("compare", "--example", "thruster", "--basis", "triangel:8"), "Did you mean 'triangular'"),
     (("compare", "--example", "thruster", "-c", "monoton"), "Did you mean 'monotone'"),

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from optid.cli.app import app
 from optid.errors import ClusterError, StudyError
 from optid.studies import Study
-from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
+from optid.studies.definition import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.execution import cluster, running, workers
 from optid.studies.grid import cells as cells_of
 from optid.studies.storage.rows import NAMES

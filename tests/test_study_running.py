@@ -15,11 +15,12 @@ import study_trouble
 from study_trouble import behave, cell, row
 
 from optid.errors import DatabaseError, StudyError
-from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.definition import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.execution import running, workers
 from optid.studies.execution.running import run, run_to_frame
 from optid.studies.storage.rows import NAMES
 from optid.studies.storage.store import Store, finished, read_rows
+from optid.studies.study import Study
 
 STUDY = Study("trouble", (DataEntry("none", system="dead_zone"),),
               (FormulationEntry("f", "arx", (), {"na": 1, "nb": 1}),), (SolverEntry("s", "clarabel"),))

@@ -32,7 +32,7 @@ import optid
 from optid.models.layout import Layout
 from optid.statistics.regression import collect
 from optid.studies import Study
-from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
+from optid.studies.definition import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.execution import running
 from optid.studies.storage import store
 from optid.studies.storage.rows import BY_NAME, NAMES

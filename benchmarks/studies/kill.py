@@ -25,10 +25,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from optid.studies.definition.description import Study
 from optid.studies.execution.machine import machine
 from optid.studies.grid import cells
 from optid.studies.storage.store import finished, read_rows
+from optid.studies.study import Study
 
 STUDY = """
 name = "six hundred cells"

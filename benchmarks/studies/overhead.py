@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from optid.data.reduction import available_cores
-from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.definition import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.execution import running, workers
 from optid.studies.execution.cell import run_cell
 from optid.studies.grid import cells

@@ -49,8 +49,8 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
 
     import_cvxpy()
     from optid.errors import StudyError
-    from optid.studies.definition.description import Study
     from optid.studies.execution import running
+    from optid.studies.study import Study
     from optid.studies.verdicts.comparison import compare as side_by_side
     from optid.studies.verdicts.comparison import verdict_on_one_record
 

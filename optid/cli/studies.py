@@ -44,9 +44,9 @@ def run(file: File = None, example: bool = False, db: File = None, workers: Work
         dry_run: List the cells that would be run, without running them.
     """
     from optid.errors import StudyError
-    from optid.studies.definition.description import Study
     from optid.studies.execution import running
     from optid.studies.storage import export as exporting
+    from optid.studies.study import Study
 
     if (file is None) != example:
         raise StudyError("give a study file, or --example for a built-in study" + (", not both" if example else ""))

@@ -120,7 +120,7 @@ def _content(files: tuple[str, ...]) -> str:
 
 @lru_cache(maxsize=64)
 def _hash(files: tuple[str, ...], _: tuple[tuple[int, int], ...]) -> str:
-    from optid.studies.definition.description import DataEntry
+    from optid.studies.definition import DataEntry
 
     try:
         return content_hash(DataEntry(name="files", files=files))

@@ -10,11 +10,12 @@ from typing import Any
 
 from optid.data.reduction import available_cores
 from optid.errors import DatabaseError, StudyError, nearest
-from optid.studies.definition.description import Study
+from optid.studies.definition import Definition, as_toml
 from optid.studies.execution.cell import known, lost_row
 from optid.studies.grid import Cell, cells, check_unchanged, located
 from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, REFUSED
 from optid.studies.storage.store import LABELS, Store
+from optid.studies.trial import check_data
 
 Row = dict[str, Any]
 Executor = Callable[[Sequence[Cell]], Iterator[Row]]
@@ -22,7 +23,7 @@ Executor = Callable[[Sequence[Cell]], Iterator[Row]]
 Progress = Callable[[int, int, Row | None], None]
 
 
-def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: Any = None,
+def run(study: Definition, db: str | Path, *, workers: int | None = None, scheduler: Any = None,
         progress: Progress | None = None, accept_changed_data: bool = False, retry: str | Sequence[str] = (),
         execute: Executor | None = None) -> list[Row]:
     """Run the cells of a study that have no row yet.
@@ -49,6 +50,7 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
         ClusterError: the cluster cannot be used.
     """
     retry = _checked(retry)
+    check_data(study)
     grid = cells(study)
     execute = execute or _executor(grid, workers, scheduler)
     with Store(db, write=True) as store, store.claim(study.name):
@@ -58,7 +60,7 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
         return store.rows_of(study.name, [cell.identity for cell in grid])
 
 
-def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, retry: str | Sequence[str] = ()
+def plan(study: Definition, db: str | Path, *, accept_changed_data: bool = False, retry: str | Sequence[str] = ()
          ) -> tuple[list[Cell], list[Cell], str]:
     """Return what a run would do, without changing the database, which need not exist.
 
@@ -67,7 +69,9 @@ def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, ret
     Returns:
         All cells, those that a run would run, and a text on the rows that it would set aside.
     """
-    retry, grid = _checked(retry), cells(study)
+    retry = _checked(retry)
+    check_data(study)
+    grid = cells(study)
     if not Path(db).exists():
         return grid, grid, ""
     with Store(db) as store, store.copy() as copy:
@@ -75,7 +79,7 @@ def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, ret
         return grid, todo, describe_previous_run(copy, study)
 
 
-def describe_previous_run(store: Store, study: Study) -> str:
+def describe_previous_run(store: Store, study: Definition) -> str:
     """Return a text on the superseded rows of a study and the reasons; empty if there are none."""
     axes = {"data": study.data, "formulation": study.formulations, "solver": study.solvers}
     known_labels = [{entry.name for entry in entries} for entries in axes.values()]
@@ -99,7 +103,7 @@ def _checked(retry: str | Sequence[str]) -> Sequence[str]:
     return retry
 
 
-def _prepared(store: Store, study: Study, grid: list[Cell], accept_changed_data: bool, retry: Sequence[str]
+def _prepared(store: Store, study: Definition, grid: list[Cell], accept_changed_data: bool, retry: Sequence[str]
               ) -> list[Cell]:
     """Make the rows of a database those of the grid, and return the cells without a row."""
     if not accept_changed_data:
@@ -112,7 +116,7 @@ def _prepared(store: Store, study: Study, grid: list[Cell], accept_changed_data:
     return [cell for cell in grid if cell.identity not in done]
 
 
-def run_to_frame(study: Study, db: str | Path | None = None, **settings: Any) -> Any:
+def run_to_frame(study: Definition, db: str | Path | None = None, **settings: Any) -> Any:
     """Run a study, by default in a temporary database; return a pandas frame, or dicts where pandas is missing."""
     with tempfile.TemporaryDirectory() as folder:
         rows = run(study, db or Path(folder) / "study.sqlite", **settings)
@@ -172,9 +176,9 @@ def _all_rows(todo: Sequence[Cell], execute: Executor) -> Generator[Row, None, N
     yield from execute([cell for cell in todo if not cell.refusal])
 
 
-def _description(study: Study) -> str:
+def _description(study: Definition) -> str:
     try:
-        return replace(study, data=[located(entry, study.folder) for entry in study.data]).to_toml()
+        return as_toml(replace(study, data=tuple(located(entry, study.folder) for entry in study.data)))
     except StudyError:  # records in memory, and other values that TOML does not hold, have no text
         return ""
 
