@@ -19,3 +19,13 @@ def p_value(p: float, digits: int = 2, missing: str = "-") -> str:
 def p_equals(p: float, digits: int = 2) -> str:
     """Write "p = 0.03", or "p < 1e-16"."""
     return f"p {p_value(p, digits)}" if p < SMALLEST else f"p = {p_value(p, digits)}"
+
+
+def seconds(value: float) -> str:
+    """Write a time in the unit that suits it; a dash where there is none."""
+    return "-" if math.isnan(value) else f"{1e3 * value:.3g} ms" if value < 0.9995 else f"{value:.3g} s"
+
+
+def short(text: str, most: int = 120) -> str:
+    """Cut a text to so many characters, the last of them an ellipsis."""
+    return text if len(text) <= most else text[: most - 1] + "…"

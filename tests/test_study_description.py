@@ -15,7 +15,7 @@ from optid.errors import LookupFailed, StudyError
 from optid.examples import EXAMPLES
 from optid.studies import definition, grid, trial
 from optid.studies.definition import DataEntry, FormulationEntry, SolverEntry
-from optid.studies.sources.records import load
+from optid.studies.records import load
 from optid.studies.sources.systems import SYSTEMS, simulate
 from optid.studies.sources.truth import Truth
 from optid.studies.study import Study

@@ -80,20 +80,30 @@ def report(db: Path, page: File = None, title: str | None = None, accuracy: floa
         accuracy: Relative accuracy of the comparison. [dim]that of most cells[/]
         clock (--time WORD): Time compared: solve (cold), fit (whole fit) or warm.
     """
-    from optid.cli.study_summary import print_former, print_models, print_reasons
-    from optid.studies.page import write_page
     from optid.studies.storage.store import rows_of_one
     from optid.studies.verdicts.verdict import conclude
 
     check_folders(page)
     verdict = conclude(rows_of_one(db, title), accuracy=accuracy, time=clock)
     print_text(str(verdict))
-    print_models(verdict)
-    print_reasons(verdict.table)
-    print_former(db, title)
+    _print_superseded(db, title)
     if page is not None:
-        write_page(verdict, page, command=command_line())
+        verdict.report(page, command=command_line())
         print_text(f"report written to {page}")
+
+
+def _print_superseded(db: Path, study: str | None) -> None:
+    """Print the number of superseded rows in a database."""
+    from optid.studies.storage.store import Store
+
+    if db.suffix == ".parquet":
+        return
+    with Store(db) as store:
+        count = sum(store.superseded(study).values())
+    if count:
+        rows, stay = ("row", "is") if count == 1 else ("rows", "are")
+        print_text(Text(f"{count:,} {rows} of former entries, data, settings or versions, or of cells that were run "
+                        f"again, {stay} kept in {db} (table superseded) and in no report", "dim"))
 
 
 def export(db: Path, target: Path, title: str | None = None) -> None:
@@ -188,7 +198,7 @@ def _now(row: dict[str, Any] | None) -> str:
         return "cells"
     from rich.markup import escape
 
-    from optid.show.wording import short
+    from optid.phrases import short
 
     formulation, solver = (escape(short(row[name], 28)) for name in ("formulation", "solver"))
     return f"[dim]{formulation} · {solver}: {row['status_verified'] or row['outcome']}[/]"
@@ -207,24 +217,18 @@ def _plan(described: Any, db: Path, **settings: Any) -> None:
 
 
 def _summary(db: Path, name: str) -> bool:
-    """Print outcomes by solver, reasons and the headline of the verdict; return whether any cell was solved."""
+    """Print the verdict of a study and how to get its page; return whether any cell has an answer."""
     import shlex
 
     import numpy as np
 
-    from optid.cli import study_summary as summary
     from optid.program.solution import Status
     from optid.studies.storage.store import read_rows
     from optid.studies.verdicts.verdict import conclude
 
     every = read_rows(db)
     rows = {column: values[every["study"] == name] for column, values in every.items()}
-    summary.print_outcomes(name, rows)
-    summary.print_reasons(rows)
-    verdict = conclude(rows)
-    summary.print_models(verdict)
-    headline = verdict.headline
-    print_text(Text.assemble((f"{headline.word}: ", "bold"), headline.text))
+    print_text(str(conclude(rows)))
     words = ["optid", "study", "report", str(db), "-o", f"{db.stem}.html"]
     words += ["--study", name] if len(rows["key"]) < len(every["key"]) else []
     print_text(Text(shlex.join(words), "dim"))

@@ -17,7 +17,7 @@ from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.search.calibration import check_draws, family_thresholds
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Dictionary
-from optid.show.wording import short
+from optid.phrases import short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,7 +9,6 @@ _HOME = {
     "study": ["Study"],
     "grid": ["Cell"],
     "verdicts.verdict": ["conclude", "Verdict"],
-    "page": ["write_page"],
 }
 
 __getattr__, __dir__ = on_first_use(__name__, _HOME)

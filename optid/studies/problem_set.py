@@ -21,7 +21,7 @@ from optid.errors import OptidError, StudyError
 from optid.program.solution import Solution, Status
 from optid.solving.solve import solve
 from optid.studies.grid import Cell, cells
-from optid.studies.sources.records import load
+from optid.studies.records import load
 from optid.studies.storage.store import Store
 from optid.studies.study import Study
 from optid.studies.trial import build_problem

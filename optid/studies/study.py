@@ -104,10 +104,10 @@ class Study(Definition):
         words = installed_solvers() if words in (ALL, [ALL]) else words if isinstance(words, list) else [words]
         settings = {key: value for key, value in raw.items() if key in TOP and key not in ("solvers", *KEYS)}
         study = cls.__new__(cls)
+        solvers = [*words, *tables] if isinstance(tables, list) else words
         try:
-            Definition.__init__(
-                study, **{"name": title, **settings}, data=raw.get("data", []), folder=Path(folder),
-                formulations=raw.get("formulation", []), solvers=[*words, *tables] if isinstance(tables, list) else words)
+            Definition.__init__(study, **{"name": title, **settings}, data=raw.get("data", []), solvers=solvers,
+                                formulations=raw.get("formulation", []), folder=Path(folder))
         except ValidationError as error:
             found = [(written(keys, len(words)), text) for keys, text in problems_of(error)]
             problems += [one for one in found if one[0] not in dict(problems)]

@@ -11,14 +11,14 @@ from optid.core.program import Program, programme_of
 from optid.data.readers import Format
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
+from optid.phrases import short
 from optid.program.solution import Status
 from optid.registry import formulation as look_up
 from optid.registry import named_constraint
-from optid.show.wording import short
 from optid.solving.solve import solve
 from optid.studies.definition import DataEntry, Definition, FormulationEntry, refuse_study
 from optid.studies.grid import located
-from optid.studies.sources.records import read_entry
+from optid.studies.records import read_entry
 from optid.studies.sources.systems import simulate, system
 
 SHORT = 300  # samples on which a formulation, and the options of a solver, are tried

@@ -12,7 +12,7 @@ from optid.errors import LookupFailed, StructureError, nearest
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
-from optid.show.wording import short
+from optid.phrases import short
 
 if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds

@@ -24,7 +24,7 @@ from optid.solving.steps import choose_solvers
 from optid.studies.execution.machine import Peak, machine
 from optid.studies.execution.worker import keep
 from optid.studies.grid import Cell, content_hash, determining
-from optid.studies.sources.records import Record, load
+from optid.studies.records import Record, load
 from optid.studies.storage.rows import (
     DONE,
     ERROR,
@@ -189,6 +189,7 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
         "reason": solution.reason, "reached": str(solution.status) in SUCCESS, "proved": solution.proof,
         "false_claim": any(step.false_claim for step in steps), "solver_used": solution.solver,
         "program_class": program.kind, "unknowns": program.size, "n_programs": len(steps),
+        "steps": as_json(_steps(fitted)),
         "objective": solution.objective, "scale": solution.scale, "bound": bound.value if bound else None,
         "gap": solution.gap, "iterations": sum(counts) if min(counts, default=-1) >= 0 else None,
         "build_s": solution.times.build, "compile_s": sum(compiled) if compiled else None,
@@ -198,6 +199,17 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
     if residuals is not None:
         row |= {name: getattr(residuals, name) for name in ("violation", "stationarity", "complementarity")}
     return row
+
+
+def _steps(fitted: Fit) -> list[dict[str, Any]]:
+    """Return one entry per step and solver of a fit."""
+    groups: dict[tuple[str, str], list[Solution]] = {}
+    for name, solution in fitted.steps:
+        groups.setdefault((name, solution.solver), []).append(solution)
+    return [{"step": step, "solver": solver, "programs": len(found),
+             "reached": sum(str(one.status) in SUCCESS for one in found),
+             "iterations": sum(one.iterations for one in found) if all(one.iterations >= 0 for one in found) else None,
+             "seconds": sum(one.times.solve for one in found)} for (step, solver), found in groups.items()]
 
 
 def _warm(cell: Cell, fitted: Fit, row: dict[str, Any], limit: float, given: float) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 from optid.errors import DataError
 from optid.program.solution import Status
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 DONE, TIME_LIMIT, MEMORY_LIMIT, CRASHED = "done", "time limit", "memory limit", "crashed"
 ERROR, REFUSED, NON_FINITE = "error", "refused", "non-finite"
@@ -93,7 +93,9 @@ COLUMNS: tuple[Column, ...] = (
     Column("solver_used", "text", "back end that ran, where auto chose it"),
     Column("program_class", "text", "class of the last programme: LP, QP, SOCP, SDP, conic or NLP"),
     Column("unknowns", "integer", "scalar variables of the last programme"),
-    Column("n_programs", "integer", "programmes solved: 1, or the steps of a procedure"),
+    Column("n_programs", "integer", "programmes solved: 1, or those of all steps of a procedure"),
+    Column("steps", "json", "one entry per step and solver: step, solver, programs, reached, iterations, seconds; the "
+                            "view `steps` has a row for each"),
     # the answer
     Column("objective", "number", "objective at the point, recomputed", "data"),
     Column("scale", "number", "objective of the zero model, the yardstick of objectives", "data"),
