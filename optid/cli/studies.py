@@ -58,8 +58,8 @@ def run(file: File = None, example: bool = False, db: File = None, workers: Work
     if dry_run:
         _plan(described, db, accept_changed_data=accept_changed_data, retry=retry or ())
         return
-    with follow_progress(db, described) as follow:
-        running.run(described, db, workers=workers, scheduler=scheduler, progress=follow,
+    with _executor(scheduler) as executor, follow_progress(db, described) as follow:
+        running.run(described, db, workers=workers, executor=executor, progress=follow,
                     accept_changed_data=accept_changed_data, retry=retry or ())
     solved = _summary(db, described.name)
     if export is not None:
@@ -67,6 +67,18 @@ def run(file: File = None, example: bool = False, db: File = None, workers: Work
         print_text(f"{count} rows written to {export}")
     if not solved:
         raise typer.Exit(NOTHING_SOLVED)
+
+
+@contextmanager
+def _executor(scheduler: str | None) -> Iterator[Any]:
+    """Give the executor of a Dask cluster; None where none is asked for."""
+    if scheduler is None:
+        yield None
+        return
+    from optid.data.clusters import connected
+
+    with connected(scheduler) as client:
+        yield client.get_executor()
 
 
 def report(db: Path, page: File = None, title: str | None = None, accuracy: float | None = None, clock: str = "solve"

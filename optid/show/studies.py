@@ -25,12 +25,12 @@ REASONS = 12  # kinds of failure that are shown
 TIME_WORDS = {"solve": "compile and solve, cold", "fit": "the whole fit", "warm": "the second, warm solve"}
 
 COUNTED = (
-    ("Solved", "the run was completed, our own residuals are within the tolerance of the compared accuracy, and no other "
-     "solver verified a lower objective. Of several repetitions every one must count."),
+    ("Solved", "the run was completed, our own residuals are within the tolerance of the compared accuracy, and no "
+     "other solver verified a lower objective. Of several repetitions every one must count."),
     ("Problem", "one record with one formulation: what every solver was given alike."),
     ("First", "who solved fewer problems than the most reliable, by more than 1 % of them and beyond chance, is no "
-     "candidate. The first is a candidate that no other one beats in time where both work. Others tie with it where the "
-     "95 % interval of the ratio of their times holds 1 or the difference is below 10 %. With fewer than 6 problems in "
+     "candidate. The first is a candidate that no other one beats in time where both work. Others tie with it where "
+     "the 95 % interval of the ratio of their times holds 1 or the difference is below 10 %. With fewer than 6 problems in "
      "common, or an interval wider than a factor of 2, it cannot be told."),
     ("Models", "compare by their fit on unseen samples, record by record, each formulation with the model of its best "
      "verified objective. Of two to five data sets each is judged by its own records; from six on each counts once."),
@@ -140,9 +140,9 @@ def model_table(models: Quality) -> Table:
     for name in models.formulations:
         rows.append((short(name, 40), *_figures(models, name)))
         rows += [(f"  on {short(one.name, 30)}", *_figures(one, name)) for one in models.sets if apart]
-    note = ("Means in % over the records that a formulation solved, of fits on samples that it did not see and of errors "
-            "against a known truth. Behind: " + ("ratio of parameter errors" if models.errors else "points of simulation "
-            "fit") + ", paired by record, with the 95 % interval.")
+    behind = "ratio of parameter errors" if models.errors else "points of simulation fit"
+    note = ("Means in % over the records that a formulation solved, of fits on samples that it did not see and of "
+            f"errors against a known truth. Behind: {behind}, paired by {models.unit}, with the 95 % interval.")
     return Table("", ("formulation", "solved", "simul.", "1-step", "params", "f", "behind"), rows, note)
 
 
@@ -172,8 +172,9 @@ def _failures(verdict: StudyVerdict) -> list[Any]:
         is_aside = one.state == REFUSED and one.solver not in verdict.overall.idle
         (refused if is_aside else said).append(f"{one.solver}: {one.state} {one.count:,}: {short(one.reason, REASON)}")
     more = [f"and {len(said) - REASONS} more reasons, which the database has"] if len(said) > REASONS else []
-    return [*([Table("Claims that were false", head, claims)] if claims else []),
-            *([Notes([*said[:REASONS], *more])] if said else []), *([Fold("Refused", [Notes(refused)])] if refused else [])]
+    parts = [(claims, Table("Claims that were false", head, claims)), (said, Notes([*said[:REASONS], *more])),
+             (refused, Fold("Refused", [Notes(refused)]))]
+    return [part for any_there, part in parts if any_there]
 
 
 def _machines(verdict: StudyVerdict) -> list[tuple[str, str]]:

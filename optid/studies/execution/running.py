@@ -3,8 +3,10 @@
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,47 +14,51 @@ from optid.data.reduction import available_cores
 from optid.errors import DatabaseError, StudyError, nearest
 from optid.studies.definition import Definition, as_toml
 from optid.studies.execution.cell import known, lost_row
+from optid.studies.execution.executors import run_here, run_with
 from optid.studies.grid import Cell, cells, check_unchanged, located
-from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, REFUSED
+from optid.studies.storage.rows import COLUMNS, KILLED, NAMES, OUTCOMES, REFUSED
 from optid.studies.storage.store import LABELS, Store
 from optid.studies.trial import check_data
 
 Row = dict[str, Any]
-Executor = Callable[[Sequence[Cell]], Iterator[Row]]
+Execution = Callable[[Sequence[Cell]], Iterator[Row]]
 """Yields one row for each cell, in any order; closing the generator ends all that it started."""
 Progress = Callable[[int, int, Row | None], None]
 
 
-def run(study: Definition, db: str | Path, *, workers: int | None = None, scheduler: Any = None,
+def run(study: Definition, db: str | Path, *, workers: int | None = None, executor: Executor | None = None,
         progress: Progress | None = None, accept_changed_data: bool = False, retry: str | Sequence[str] = (),
-        execute: Executor | None = None) -> list[Row]:
+        execute: Execution | None = None) -> list[Row]:
     """Run the cells of a study that have no row yet.
 
     Args:
         study: what to run.
         db: the database; made when it is not there.
         workers: processes on this machine; one per core when not given.
-        scheduler: Dask scheduler whose workers run the cells instead, as for `optid.data.clusters.connected`: an
-            address, a scheduler file or a Client.
+        executor: of `concurrent.futures`, or one like it such as Dask's ``Client(...).get_executor()``, whose workers
+            run the cells instead; they must see data files under the same path, and have the same versions.
         progress: called with (cells that have a row, all cells, None) before work starts and with the row after each.
         accept_changed_data: run cells again whose data file is not what it was; their former rows are set aside.
         retry: outcomes whose rows are set aside and run again, such as "crashed" or "time limit"; rows of other
             studies with such an outcome are not taken over.
-        execute: another way to run cells, in place of ``workers`` and ``scheduler``.
+        execute: another way to run cells, in place of ``workers`` and ``executor``.
 
     Returns:
         The rows of all cells of the study, in the order of its grid.
 
     Raises:
-        StudyError: a data file changed since the last run, or an unknown outcome to retry.
+        StudyError: a data file changed since the last run, an unknown outcome to retry, or an executor that broke
+            (what is finished is kept then).
         DatabaseError: another run is writing to the database, it is of another schema version, or it cannot be written
             (what is finished is kept then, and the next run goes on from there).
-        ClusterError: the cluster cannot be used.
     """
     retry = _checked(retry)
     check_data(study)
     grid = cells(study)
-    execute = execute or _executor(grid, workers, scheduler)
+    if workers is not None and executor is not None:
+        raise StudyError("workers are processes of this machine, an executor has its own: leave one of them out")
+    execute = execute or (partial(run_here, workers=available_cores(workers, "workers", StudyError))
+                          if executor is None else partial(run_with, executor))
     with Store(db, write=True) as store, store.claim(study.name):
         todo = _prepared(store, study, grid, accept_changed_data, retry)
         store.describe(study.name, _description(study))
@@ -109,8 +115,7 @@ def _prepared(store: Store, study: Definition, grid: list[Cell], accept_changed_
     if not accept_changed_data:
         check_unchanged(grid, store.data_hashes())
     store.keep(study.name, [cell.identity for cell in grid])
-    if retry:
-        store.set_aside(study.name, retry)
+    store.set_aside(study.name, [KILLED, *retry])
     store.append(_relabelled(store, grid, retry))
     done = store.finished(study.name)
     return [cell for cell in grid if cell.identity not in done]
@@ -132,22 +137,7 @@ def run_to_frame(study: Definition, db: str | Path | None = None, **settings: An
     return frame
 
 
-def _executor(grid: Sequence[Cell], workers: int | None, scheduler: Any) -> Executor:
-    if workers is not None and scheduler is not None:
-        raise StudyError("workers are processes of this machine, a cluster has its own: leave workers or scheduler out")
-    if scheduler is not None:
-        from optid.studies.execution import cluster
-
-        with cluster.connected(scheduler, cluster.packages(grid)):  # refused before the database is made
-            pass
-        return lambda todo: cluster.execute(todo, scheduler=scheduler)
-    from optid.studies.execution import workers as processes
-
-    available_cores(workers, "workers", StudyError)
-    return lambda todo: processes.execute(todo, workers=workers)
-
-
-def _work(todo: list[Cell], total: int, execute: Executor, store: Store, progress: Progress | None) -> None:
+def _work(todo: list[Cell], total: int, execute: Execution, store: Store, progress: Progress | None) -> None:
     done = total - len(todo)
     if progress is not None:
         progress(done, total, None)
@@ -170,7 +160,7 @@ def _work(todo: list[Cell], total: int, execute: Executor, store: Store, progres
         raise StudyError(f"{len(expected)} cells of {total} returned no row; run the study again")
 
 
-def _all_rows(todo: Sequence[Cell], execute: Executor) -> Generator[Row, None, None]:
+def _all_rows(todo: Sequence[Cell], execute: Execution) -> Generator[Row, None, None]:
     """Yield the rows of refused cells, then those of the others."""
     yield from (lost_row(cell, REFUSED, cell.refusal) for cell in todo if cell.refusal)
     yield from execute([cell for cell in todo if not cell.refusal])
@@ -194,4 +184,4 @@ def _relabelled(store: Store, grid: Iterable[Cell], retry: Sequence[str]) -> lis
             if there.get((cell.study, *cell.identity)) != tuple(labels.values()):
                 wanted[cell.identity] = labels
     return [row | wanted[row["key"], row["repetition"]] for row in store.rows_of(None, wanted)
-            if row["outcome"] not in retry]
+            if row["outcome"] not in (KILLED, *retry)]

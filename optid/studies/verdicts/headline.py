@@ -4,7 +4,7 @@ from collections import Counter
 
 from optid.phrases import plural, seconds
 from optid.studies.verdicts.averages import Paired
-from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, NOBODY, ONLY_ONE, TIE, Choice
+from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, ONLY_ONE, TIE, Choice
 from optid.studies.verdicts.models import DataSet, Quality
 from optid.studies.verdicts.outcomes import Results
 from optid.studies.verdicts.standings import Standing, StandingsSection
@@ -30,6 +30,8 @@ def headline(overall: StandingsSection, sections: tuple[StandingsSection, ...], 
         return solver_statement(overall)
     leaders = _leaders(overall, decided)
     word = "; ".join(f"{name} for {listed([one.name for one in theirs])}" for name, theirs in leaders.items())
+    if len(leaders) == 1 and len(decided) == len(sections):
+        word = f"Use {next(iter(leaders))}"
     most = max(overall.standings, key=lambda s: (s.solved, s.solver))
     text = f"{compared(overall.found)}. {most.solver} solved most, {of(most.solved, len(overall.found.data))}."
     if len(decided) < len(several):
@@ -95,6 +97,8 @@ def solver_statement(section: StandingsSection) -> Statement:
     if not section.recommended:
         return Statement(BAD, "No solver can be recommended", text)
     word = f"A tie: {listed(choice.leaders)}" if choice.kind == TIE else f"Use {lead.solver}"
+    if choice.kind == FIRST and lead.refused > RARE * n:
+        word += " where it runs"
     return Statement(_tone(lead, n), word, text)
 
 

@@ -9,7 +9,17 @@ from scipy.stats import mode
 
 from optid.errors import DataError
 from optid.program.solution import GRADIENT, Status, tolerance
-from optid.studies.storage.rows import CRASHED, DONE, ERROR, MEMORY_LIMIT, NON_FINITE, REFUSED, SUCCESS, TIME_LIMIT
+from optid.studies.storage.rows import (
+    CRASHED,
+    DONE,
+    ERROR,
+    KILLED,
+    MEMORY_LIMIT,
+    NON_FINITE,
+    REFUSED,
+    SUCCESS,
+    TIME_LIMIT,
+)
 
 SOLVED, NOT_RUN = "solved", "not run"
 FALSE_CLAIM, CONTRADICTED, INFEASIBLE = "false claim", "contradicted", str(Status.INFEASIBLE)
@@ -18,7 +28,7 @@ WARM_FAILED, UNTIMED = "warm solve failed", "no time"
 VALUE = 1e-6  # relative difference of objectives up to which two runs found the same minimum
 TIMES = {"solve": ("compile_s", "solve_s"), "fit": ("fit_s",), "warm": ("warm_s",)}  # measures: sums of columns
 VERIFIED = (SOLVED, WARM_FAILED, UNTIMED)  # the accuracy was reached, with or without a time
-UNANSWERED = (TIME_LIMIT, MEMORY_LIMIT, CRASHED, ERROR, str(Status.LIMIT))  # ended before the solver had an answer
+UNANSWERED = (TIME_LIMIT, MEMORY_LIMIT, CRASHED, KILLED, ERROR, str(Status.LIMIT))  # no answer of the solver
 MEANINGS = {
     SOLVED: "the verified accuracy was reached, at the best objective that any solver verified",
     FALSE_CLAIM: "the solver claimed success or infeasibility, which the verified residuals contradict",

@@ -27,7 +27,10 @@ def compare_steps(table: Table) -> tuple[StepStanding, ...]:
     runs: dict[tuple[str, str, str], list[dict[str, float]]] = {}
     several: set[str] = set()
     for formulation, text in zip(table["formulation"], table["steps"]):
-        steps = json.loads(text) if text else []
+        try:
+            steps = json.loads(text)
+        except ValueError:  # a run that got no answer, or rows of another program
+            continue
         if len({step["step"] for step in steps}) > 1:
             several.add(formulation)
         for step in steps:
