@@ -99,7 +99,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("optid", "pebble", "numpy"))
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("optid", "numpy"))
     print(f"{machine()}; {versions}")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "study.toml"

@@ -24,8 +24,8 @@ from optid.show.sections import (
     Banner,
     Charts,
     Code,
-    Columns,
     Document,
+    FactColumns,
     Findings,
     Fold,
     Heading,
@@ -178,7 +178,7 @@ def _optimum(fit: "Fit") -> list[Any]:
     right = [(name, value) for name, value in summary.certificate_facts(fit)
              if name in ("Objective", "Bound", "Relative gap")]
     right += [(name, value) for name, value in summary.solver_facts(fit) if name in ("Solver", "Iterations", "Total")]
-    return [Banner(tone, f"Solution: {word}", sentence, tuple(cards)), Columns(summary.record_facts(fit), right),
+    return [Banner(tone, f"Solution: {word}", sentence, tuple(cards)), FactColumns(summary.record_facts(fit), right),
             *filter(None, [summary.steps_table(fit)]), *([Notes(fit.findings)] if fit.findings else [])]
 
 

@@ -127,7 +127,7 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class Columns:
+class FactColumns:
     """Facts in two columns where there is room."""
 
     left: Facts

@@ -30,8 +30,8 @@ COUNTED = (
     ("Problem", "one record with one formulation: what every solver was given alike."),
     ("First", "who solved fewer problems than the most reliable, by more than 1 % of them and beyond chance, is no "
      "candidate. The first is a candidate that no other one beats in time where both work. Others tie with it where "
-     "the 95 % interval of the ratio of their times holds 1 or the difference is below 10 %. With fewer than 6 problems in "
-     "common, or an interval wider than a factor of 2, it cannot be told."),
+     "the 95 % interval of the ratio of their times holds 1 or the difference is below 10 %. With fewer than 6 "
+     "problems in common, or an interval wider than a factor of 2, it cannot be told."),
     ("Models", "compare by their fit on unseen samples, record by record, each formulation with the model of its best "
      "verified objective. Of two to five data sets each is judged by its own records; from six on each counts once."),
     ("Profile", "share of the problems solved within a factor of the fastest time (Dolan and Moré, 2002)."),
@@ -95,11 +95,12 @@ def solver_table(section: StandingsSection) -> Table:
         return "1" if one.solver == first else _interval(pair) if pair else "-"
 
     rows = [(short(one.solver, 40), f"{one.solved:,} of {one.problems:,}", number(one.residual, 2), seconds(one.time),
-             ratio(one), f"{one.proved:,}", f"{one.false_claims:,}") for one in section.standings]
-    note = f"Ratios of times are paired by problem, with their 95 % interval. Accuracy {section.found.accuracy:.0e}."
+             ratio(one), f"{one.proved:,}", f"{one.refused:,}", f"{one.false_claims:,}") for one in section.standings]
+    note = (f"Ratios of times are paired by problem, with their 95 % interval. False: claims of success. Accuracy "
+            f"{section.found.accuracy:.0e}.")
     note += f" Not run: {', '.join(section.idle)}." if section.idle else ""
     head = ("solver", "solved", "residual", "time", f"time / {short(first, 16)}" if first else "time ratio", "proved",
-            "false claims")
+            "refused", "false")
     return Table(section.name, head, rows, note)
 
 

@@ -5,7 +5,7 @@ from itertools import zip_longest
 from textwrap import wrap
 
 from optid.data.description import listed_findings
-from optid.show.sections import Banner, Code, Columns, Document, Facts, Findings, Notes, Pair
+from optid.show.sections import Banner, Code, Document, FactColumns, Facts, Findings, Notes, Pair
 from optid.show.wording import Table
 
 WIDTH, LEFT = 80, 36
@@ -28,7 +28,7 @@ def part_lines(part: object) -> list[str]:
     """Return the lines of a part; none for charts and folds."""
     if isinstance(part, Banner):
         return [*wrapped(part.word), *(wrapped(part.sentence) if part.sentence else [])]
-    if isinstance(part, Columns):
+    if isinstance(part, FactColumns):
         return _columns(part.left, part.right)
     if isinstance(part, list):
         return facts_lines(part)
