@@ -331,15 +331,11 @@ def _check_labels(entries: Sequence[Any]) -> None:
             for i, name in enumerate(names) if name in names[:i]])
 
 
-def _spread(value: Any, marks: Sequence[str], word: str = "") -> list[Any]:
-    """Return the entries of an axis as tables: one, several, or {label: entry}; a bare text is the value of a word."""
-    def table(entry: Any, label: str = "") -> Any:
-        if isinstance(entry, str) and word:
-            entry = {word: entry}
-        return {"name": label, **entry} if label and isinstance(entry, Mapping) else entry
-
+def _spread(value: Any, marks: Sequence[str], table: Callable[[Any], Any]) -> list[Any]:
+    """Return the entries of an axis as tables: one, several, or {label: entry} where no key is a mark of a table."""
     if isinstance(value, Mapping) and not any(mark in value for mark in marks):
-        return [table(entry, str(label)) for label, entry in value.items()]
+        return [{"name": str(label), **made} if isinstance(made := table(entry), Mapping) else entry
+                for label, entry in value.items()]
     return [table(entry) for entry in (value if isinstance(value, list | tuple) else [value])]
 
 
@@ -352,10 +348,7 @@ def _data_axis(value: Any) -> tuple[DataEntry, ...]:
             return {"system" if known else "file": str(entry)}
         return entry
 
-    if isinstance(value, Mapping) and not any(mark in value for mark in KEYS["data"]):
-        value = [{"name": str(label), **made} if isinstance(made := table(entry), Mapping) else entry
-                 for label, entry in value.items()]
-    raw = [table(entry) for entry in _spread(value, KEYS["data"])]
+    raw = _spread(value, KEYS["data"], table)
     if not raw:
         raise ValueError("there is no [[data]]: a study needs at least one")
     return _validate_each(DataEntry, raw, "a record, optid.Data(u, y, dt), the name of a file or of a simulated system")
@@ -363,7 +356,7 @@ def _data_axis(value: Any) -> tuple[DataEntry, ...]:
 
 def _formulation_axis(value: Any, info: ValidationInfo) -> tuple[FormulationEntry, ...]:
     """Return the formulations, for each table the grid over its arguments with several values."""
-    raw, data = _spread(value, ("formulation",)), info.data.get("data", ())
+    raw, data = _spread(value, ("formulation",), lambda entry: entry), info.data.get("data", ())
     if not raw:
         raise ValueError("there is no [[formulation]]: a study needs at least one")
     found: list[FormulationEntry] = []
@@ -414,7 +407,8 @@ def installed_solvers() -> list[str]:
 
 
 def _solver_axis(value: Any) -> tuple[SolverEntry, ...]:
-    raw = _spread(installed_solvers() if _plain(value) in (ALL, [ALL]) else _plain(value), ("solver",), "solver")
+    raw = _spread(installed_solvers() if _plain(value) in (ALL, [ALL]) else _plain(value), ("solver",),
+                  lambda entry: {"solver": entry} if isinstance(entry, str) else entry)
     if not raw:
         raise ValueError("there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]")
     return _validate_each(SolverEntry, raw, "the name of a solver")
@@ -457,8 +451,7 @@ def problems_of(error: ValidationError) -> list[Problem]:
             text = f"must {text.removeprefix('Input should ')}; {_shown(line['input'])} is not"
         if line["type"] == "string_pattern_mismatch":
             text = "must be a text that is not blank"
-        keys = tuple("file" if key == "files" else key for key in line["loc"] if key not in ("record", "system"))
-        found.append((keys if line["loc"][-1:] not in (("system",), ("record",)) else line["loc"], text))
+        found.append((tuple("file" if key == "files" else key for key in line["loc"]), text))
     return found
 
 

@@ -108,7 +108,8 @@ def _file_tables(path: Path, kind: str, how: Format) -> list[RawTable]:
     if kind in TEXT:
         file = open_csv(path, replace(how, delimiter="\t") if kind == ".tsv" and not how.delimiter else how)
         return [RawTable(path.name, file.names, file.columns, file.layout.how, None, file.layout.dates,
-                         file.layout.units, advice=file.layout.advice, hints=file.layout.hints, findings=file.layout.findings)]
+                         file.layout.units, advice=file.layout.advice, hints=file.layout.hints,
+                         findings=file.layout.findings)]
     if kind == ".parquet":
         from optid.data.reading.parquet import load_parquet, parquet_head
 
