@@ -259,7 +259,6 @@ def _start(handle: int, lifeline: int) -> "subprocess.Popen[Any]":
 
 
 @atexit.register
-def end_resting() -> None:
-    """End the processes of this one that rest."""
+def _end_resting() -> None:
     for worker in _resting.pop(os.getpid(), []):
         worker.kill()

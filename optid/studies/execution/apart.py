@@ -30,6 +30,7 @@ from optid.studies.grid import Cell
 from optid.studies.storage.rows import CRASHED, ERROR, KILLED, MEMORY_LIMIT, TIME_LIMIT, complete
 
 TICK = 0.2  # seconds between looks whether a silent process is alive: a child of it may hold its connection
+TRIES = 3  # processes that may end before a cell begins
 KEPT_MB = 150.0  # memory that a process may hold of its cells without being replaced
 TOLD, LAST = 100_000, 300  # bytes of the standard error that are searched, characters of it in a reason
 FROM_OUTSIDE = ("signal SIGKILL", "signal SIGTERM")  # ends that no cell causes by itself
@@ -50,7 +51,8 @@ class CellRunner:
     """
 
     def __init__(self, function: RowFunction = run_cell) -> None:
-        self._function, self._workers, self._lock, self._ended = function, set[Worker](), threading.Lock(), False
+        self._function, self._lock, self._ended = function, threading.Lock(), False
+        self._busy, self._idle = set[Worker](), list[Worker]()
         try:
             self._packed, self._prepare = pack(_run_here), pack(prepare if function is run_cell else bool)
             pickle.dumps(function)
@@ -72,19 +74,26 @@ class CellRunner:
             return self._run(cell, Path(folder), arguments)
 
     def end(self) -> None:
-        """End the processes of the cells under way, from another thread."""
+        """End all processes, from any thread."""
         with self._lock:
             self._ended = True
-            for worker in self._workers:
+            for worker in self._busy:
                 worker.kill_process()
+            while self._idle:
+                self._idle.pop().kill()
+
+    def release(self) -> None:
+        """Leave the processes to others; they end when nobody needs them for a while."""
+        while self._idle:
+            self._idle.pop().rest()
 
     def _run(self, cell: Cell, folder: Path, arguments: bytes) -> Row:
-        worker = self._started()
+        try:
+            worker = self._begun(arguments)
+        except Unsendable as error:
+            return lost_row(cell, ERROR, f"the worker could not run it: {error}")
         started, clock, keeps = datetime.now(UTC), time.monotonic(), False
         try:
-            worker.request(self._packed, arguments, quiet=True)
-            worker.wait_until_begun()
-            clock = time.monotonic()
             if not _answers(worker, cell.time_limit + GRACE):
                 raise TimeoutError
             row, outcome, reason, keeps = worker.receive()
@@ -97,13 +106,40 @@ class CellRunner:
         except Exception as error:
             return lost_row(cell, ERROR, f"the worker could not run it: {type(error).__name__}: {error}")
         finally:
-            with self._lock:
-                self._workers.discard(worker)
-            worker.rest() if keeps else worker.kill()
+            self._put_back(worker, keeps)
+
+    def _begun(self, arguments: bytes) -> Worker:
+        """Return a process in which the cell of these packed arguments begins; one that ends before is replaced."""
+        for _ in range(TRIES):
+            worker = self._started()
+            try:
+                worker.request(self._packed, arguments, quiet=True)
+                worker.wait_until_begun()
+                return worker
+            except ChildProcessError:
+                self._put_back(worker, False)
+            except BaseException:
+                self._put_back(worker, False)
+                raise
+        raise StudyError(f"{TRIES} workers in a row ended before a cell began")
+
+    def _put_back(self, worker: Worker, keeps: bool) -> None:
+        """Keep a process for another cell, or end it."""
+        with self._lock:
+            self._busy.discard(worker)
+            keeps = keeps and not self._ended
+            if keeps:
+                self._idle.append(worker)
+        if not keeps:
+            worker.kill()
 
     def _started(self) -> Worker:
         """Return a process that has imported what cells need."""
-        worker = None
+        with self._lock:
+            worker = self._idle.pop() if self._idle else None
+            if worker is not None:
+                self._busy.add(worker)
+                return worker
         try:
             (worker,) = start_workers(1, self._prepare, pack(()), quiet=True)
             worker.receive()
@@ -112,15 +148,20 @@ class CellRunner:
                 worker.kill()
             raise StudyError(f"a worker ended before it was ready: {type(error).__name__}: {error}") from None
         with self._lock:
-            self._workers.add(worker)
-            if self._ended:
-                worker.kill_process()
-        return worker
+            if not self._ended:
+                self._busy.add(worker)
+                return worker
+        worker.kill()
+        raise StudyError("the run has ended")
 
 
 def run_apart(cell: Cell, function: RowFunction = run_cell) -> Row:
     """Return the row of a cell from another process; the task of an executor."""
-    return CellRunner(function)(cell)
+    runner = CellRunner(function)
+    try:
+        return runner(cell)
+    finally:
+        runner.release()
 
 
 def _answers(worker: Worker, seconds: float) -> bool:

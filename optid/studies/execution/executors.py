@@ -16,7 +16,6 @@ from concurrent.futures import (
 from functools import partial
 
 from optid.errors import StudyError
-from optid.processes import end_resting
 from optid.studies.execution.apart import CellRunner, Row, RowFunction, run_apart
 from optid.studies.execution.cell import lost_row, run_cell, versions_of
 from optid.studies.grid import Cell
@@ -48,7 +47,6 @@ def run_here(cells: Iterable[Cell], function: RowFunction = run_cell, *, workers
     finally:
         runner.end()
         pool.shutdown(cancel_futures=True)
-        end_resting()
 
 
 def run_with(executor: Executor, cells: Iterable[Cell], function: RowFunction = run_cell) -> Iterator[Row]:
