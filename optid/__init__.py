@@ -30,7 +30,7 @@ _HOME = {
     "identify.recursive": ["RecursiveARX"],
     "faults": ["Fault"],
     "identify.resampling": ["bootstrap"],
-    "studies.definition.description": ["Study"],
+    "studies.study": ["Study"],
     "identify.design": ["design", "frequency_response"],
 }
 _MODULES = {name: name for name in ("signals", "bases", "errors", "examples", "plants", "faults", "studies")} | {

@@ -47,7 +47,7 @@ from optid.models.files import load as load
 from optid.identify.recursive import RecursiveARX as RecursiveARX
 from optid.faults import Fault as Fault
 from optid.identify.resampling import bootstrap as bootstrap
-from optid.studies.definition.description import Study as Study
+from optid.studies.study import Study as Study
 from optid.identify.design import design as design
 from optid.identify.design import frequency_response as frequency_response
 from optid.identify.search import identify as identify

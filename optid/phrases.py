@@ -21,6 +21,11 @@ def p_equals(p: float, digits: int = 2) -> str:
     return f"p {p_value(p, digits)}" if p < SMALLEST else f"p = {p_value(p, digits)}"
 
 
+def seconds(value: float) -> str:
+    """Write a time in the unit that suits it; a dash where there is none."""
+    return "-" if math.isnan(value) else f"{1e3 * value:.3g} ms" if value < 0.9995 else f"{value:.3g} s"
+
+
 def short(text: str, most: int = 120) -> str:
     """Cut a text to so many characters, the last of them an ellipsis."""
     return text if len(text) <= most else text[: most - 1] + "…"

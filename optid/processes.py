@@ -94,7 +94,7 @@ class Worker:
         try:
             self.connection.send((function, arguments, memory, quiet))
         except OSError:
-            raise ChildProcessError(self._death()) from None
+            raise ChildProcessError(self.describe_death()) from None
 
     def wait_until_begun(self) -> bool:
         """Wait until the function is about to run; False if the process must be replaced by a new one first.
@@ -104,7 +104,7 @@ class Worker:
         try:
             message = self.connection.recv()
         except (EOFError, OSError):
-            raise ChildProcessError(self._death()) from None
+            raise ChildProcessError(self.describe_death()) from None
         return message == BEGUN if isinstance(message, str) else _opened(message)
 
     def receive(self) -> Any:
@@ -112,7 +112,7 @@ class Worker:
         try:
             message = self.connection.recv()
         except (EOFError, OSError):
-            raise ChildProcessError(self._death()) from None
+            raise ChildProcessError(self.describe_death()) from None
         return _opened(message)
 
     def rest(self) -> None:
@@ -122,21 +122,24 @@ class Worker:
         self.has_rested = True
         _resting[os.getpid()].append(self)
 
+    def kill_process(self) -> None:
+        """End the process and its children at once, from any thread; `kill` must follow."""
+        if sys.platform != "win32":
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.kill()
+
     def kill(self) -> None:
         """End the process at once."""
-        if sys.platform == "win32":
-            self._process.kill()
-        else:
-            with suppress(ProcessLookupError, PermissionError):  # its own children, too
-                os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.kill()
+        self.kill_process()
         self._process.wait()
         self.connection.close()
         if self._lifeline >= 0:
             os.close(self._lifeline)
             self._lifeline = -1
 
-    def _death(self) -> str:
+    def describe_death(self) -> str:
+        """Return how a process that is ending has ended, in words."""
         with suppress(subprocess.TimeoutExpired):
             return death(self._process.wait(10.0))
         return "it closed its connection"

@@ -18,7 +18,7 @@ def cell_workers(pid):
     found = []
     for process in psutil.Process(pid).children(recursive=True):
         with suppress(psutil.NoSuchProcess):  # it has ended since it was listed
-            if "spawn_main" in " ".join(process.cmdline()):
+            if "optid.child" in " ".join(process.cmdline()):
                 found.append(process.pid)
     return found
 

@@ -21,9 +21,9 @@ import optid
 from optid.cli.app import app
 from optid.faults import diagnose, dictionary
 from optid.registry import FORMULATIONS, registered
-from optid.studies.definition.description import Study
 from optid.studies.execution.running import run
 from optid.studies.storage.store import append
+from optid.studies.study import Study
 
 EXIT_CODES = {0, 2, 3, 4}
 """What docs/build_steps.py documents, without 1 (a defect of optid) and 130 (Ctrl-C)."""

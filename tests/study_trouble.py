@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.studies.definition.description import DataEntry
-from optid.studies.execution.worker import keep
+from optid.studies.definition import DataEntry
+from optid.studies.execution.cell import keep
 from optid.studies.grid import Cell
 from optid.studies.storage.rows import as_json, complete
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from optid.studies import grid
-from optid.studies.definition.description import Study
+from optid.studies.study import Study
 
 FOLDER = Path(__file__).parent.parent / "examples" / "studies"
 STUDIES = sorted(path.stem for path in FOLDER.glob("*.toml"))
@@ -104,10 +104,10 @@ def test_the_table_in_the_documentation_says_that_nothing_is_unverified():
 
 
 def test_every_key_and_every_study_is_documented():
-    from optid.studies.definition import entries
+    from optid.studies.definition import KEYS, TOP
 
     text = (FOLDER / "README.md").read_text()
-    for keys in (entries._TOP, entries._DATA, entries._FORMULATION, entries._SOLVER):
+    for keys in (TOP, *KEYS.values()):
         assert all(f"`{key}`" in text or f"[[{key}]]" in text for key in keys)
     assert all(f"`{name}.toml`" in text for name in STUDIES)
     assert all(f"| {count:,} |" in text for count in CELLS.values())

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from optid.errors import StudyError
-from optid.studies.definition.description import Study
 from optid.studies.execution.running import _description
 from optid.studies.problem_set import write_problems
 from optid.studies.storage.store import Store
+from optid.studies.study import Study
 
 STUDY = """
 name = "problems"

@@ -15,11 +15,13 @@ import study_trouble
 from study_trouble import behave, cell, row
 
 from optid.errors import DatabaseError, StudyError
-from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
-from optid.studies.execution import running, workers
+from optid.studies.definition import DataEntry, FormulationEntry, SolverEntry
+from optid.studies.execution import running
+from optid.studies.execution.executors import run_here
 from optid.studies.execution.running import run, run_to_frame
 from optid.studies.storage.rows import NAMES
 from optid.studies.storage.store import Store, finished, read_rows
+from optid.studies.study import Study
 
 STUDY = Study("trouble", (DataEntry("none", system="dead_zone"),),
               (FormulationEntry("f", "arx", (), {"na": 1, "nb": 1}),), (SolverEntry("s", "clarabel"),))
@@ -107,7 +109,6 @@ def test_rows_nobody_asked_for_and_doubles_are_left_out(path, grid):
 @pytest.mark.parametrize("settings, words", [
     ({"workers": 0}, "a positive integer"), ({"workers": 2.0}, "a positive integer"),
     ({"workers": True}, "a positive integer"),
-    ({"workers": 2, "scheduler": "tcp://x:1"}, "leave workers or scheduler out"),
     ({"retry": ["done", "crahsed"]}, "Did you mean 'crashed'"),
 ])
 def test_settings_that_make_no_sense_are_refused_before_the_database_is_made(path, grid, settings, words):
@@ -330,7 +331,7 @@ def test_every_trouble_in_one_study(path, grid):
     ways = ["fine", "segfault", "fine", "loop", "hog", "leave", "raise", "fine", "partial", "fine"]
     limits = {"loop": {"time_limit": 0.5}, "hog": {"memory_limit": 500.0}}
     grid([cell(k, do, **limits.get(do, {})) for k, do in enumerate(ways)])
-    rows = run(STUDY, path, execute=partial(workers.execute, function=behave, workers=2))
+    rows = run(STUDY, path, execute=partial(run_here, function=behave, workers=2))
     assert [r["outcome"] for r in rows] == ["done", "crashed", "done", "time limit", "memory limit", "crashed", "error",
                                             "done", "error", "done"]
     assert all(r["reason"] for r in rows if r["outcome"] != "done")
@@ -371,12 +372,13 @@ import sys
 sys.path.insert(0, {tests!r})
 from functools import partial
 from study_trouble import behave, cell
-from optid.studies.execution import running, workers
+from optid.studies.execution import running
+from optid.studies.execution.executors import run_here
 from test_study_running import STUDY
 slow = int(sys.argv[1])  # these last until the kill
 running.cells = lambda study: [cell(k, seconds=0.02 if k < slow else 600.0, time_limit=900.0, log={log!r})
                                for k in range({count})]
-running.run(STUDY, {path!r}, execute=partial(workers.execute, function=behave, workers=2))
+running.run(STUDY, {path!r}, execute=partial(run_here, function=behave, workers=2))
 """
 
 
@@ -399,7 +401,7 @@ def test_killed_at_any_moment_and_run_again_every_cell_is_there_once(path, tmp_p
         if path.exists():
             assert len(finished(path)) <= begun()  # it opens
     cells = grid([cell(k, seconds=0.0, log=str(log)) for k in range(count)])
-    rows = run(STUDY, path, execute=partial(workers.execute, function=behave, workers=2))
+    rows = run(STUDY, path, execute=partial(run_here, function=behave, workers=2))
     assert [r["key"] for r in rows] == [c.key for c in cells] and len(finished(path)) == count
     assert begun() <= count + 3 * 4  # run twice: at most what three kills found in flight, with one waiting each
 

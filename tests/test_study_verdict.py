@@ -27,24 +27,24 @@ def models(fits, problems=12, truth=True):
 
 def test_formulations_are_compared_by_simulation_fit_record_by_record():
     verdict = conclude(models({"exact": 0.0, "relaxed": -1.5, "linear": -9.0}))
-    choice = verdict.quality.choice
+    choice = verdict.models.choice
     assert choice.kind == FIRST and choice.first == "exact"
     assert choice.against["relaxed"].value == pytest.approx(1.5, abs=0.1)
     assert verdict.headline.word == "Best models: exact"  # a single solver: the formulations are what is compared
-    assert f"The next, relaxed, stays {choice.against['relaxed'].value:.2f} points behind" in verdict.headline.text
+    value = choice.against["relaxed"].value
+    assert f"the next, relaxed, is behind by {value:.2f} points (95 %:" in verdict.headline.text
     blind = models({"exact": 0.0, "relaxed": -1.5})
     for k, row in enumerate(blind):
         size = 0.01 if row["formulation"] == "exact" else 0.03
         row |= {"simulation_fit": None, "parameter_error": (1 + k % 5) * size}
     verdict = conclude(blind)
-    assert verdict.quality.measure == "parameter_error" and verdict.headline.word == "Best models: exact"
-    value = verdict.quality.choice.against["relaxed"].value
+    assert verdict.models.measure == "parameter_error" and verdict.headline.word == "Best models: exact"
+    value = verdict.models.choice.against["relaxed"].value
     assert f"relaxed, has {value:.3g} times the error" in verdict.headline.text and value > 2
-    assert any(s.word == "Only one solver" for s in verdict.statements)
     tie = conclude(models({"exact": 0.0, "relaxed": -0.02}))
-    assert tie.quality.choice.kind == TIE and tie.headline.word.startswith("Equal models")
+    assert tie.models.choice.kind == TIE and tie.headline.word.startswith("Equal models")
     few = conclude(models({"exact": 0.0, "relaxed": -5.0}, problems=3))
-    assert few.quality.choice.kind == CANNOT_TELL
+    assert few.models.choice.kind == CANNOT_TELL
 
 
 def test_the_model_of_the_best_verified_objective_speaks_for_a_formulation():
@@ -52,13 +52,13 @@ def test_the_model_of_the_best_verified_objective_speaks_for_a_formulation():
     for p in range(7):
         rows += [run("a", p, simulation_fit=80.0), run("b", p, simulation_fit=70.0, objective=1.5),
                  run("lie", p, simulation_fit=99.0, objective=0.1, false_claim=True)]  # fmt: skip
-    assert conclude(rows).quality.figures["simulation_fit"]["exact"] == 80.0
+    assert conclude(rows).models.figures["simulation_fit"]["exact"] == 80.0
 
 
 def test_models_are_compared_whatever_clock_is_asked_for():
     rows = models({"exact": 0.0, "relaxed": -1.5})
     cold, warm = conclude(rows), conclude(rows, time="warm")
-    assert not warm.overall.standings and warm.quality.choice == cold.quality.choice
+    assert not warm.overall.standings and warm.models.choice == cold.models.choice
     assert any(s.word == "Best models: exact" for s in warm.statements)
 
 
@@ -67,37 +67,28 @@ def test_a_formulation_that_is_solved_less_often_is_compared_where_it_is_solved(
     for row in rows:
         if row["formulation"] == "exact" and row["seed"] < 3:
             row |= {"status_verified": "limit"}
-    choice = conclude(rows).quality.choice
+    choice = conclude(rows).models.choice
     assert choice.kind == FIRST and choice.first == "exact" and choice.against["linear"].n == 9
     for row in rows:
         if row["formulation"] == "exact" and row["seed"] < 11:
             row |= {"status_verified": "limit"}
-    assert conclude(rows).quality.choice.candidates == ("linear",)
-    assert "no other has a simulation fit on half as many records" in str(conclude(rows))
+    assert conclude(rows).models.choice.candidates == ("linear",)
+    assert "no other has one on half as many records" in conclude(rows).headline.text
 
 
 def test_models_are_compared_by_what_most_formulations_have_on_most_records():
     rows = [run("a", p, formulation=f, parameter_error=(1 + p) * e, simulation_fit=90.0 if (f, p) == ("g", 0) else None)
             for p in range(8) for f, e in (("f", 0.01), ("g", 0.05))]  # fmt: skip
-    quality = conclude(rows).quality
+    quality = conclude(rows).models
     assert (quality.measure, quality.choice.kind, quality.choice.first) == ("parameter_error", FIRST, "f")
     both = [{**row, "simulation_fit": 80.0 + 5 * (row["formulation"] == "g")} for row in rows]
-    assert conclude(both).quality.measure == "simulation_fit"
-
-
-def test_formulations_rank_over_the_data_sets_they_were_all_tried_on():
-    rows = [run("a", seed, data=f"set {d}", formulation=f, simulation_fit=80.0 - loss + 0.01 * seed)
-            for d in range(8) for seed in range(2) for f, loss in (("x", 0), ("y", 3), ("z", 9))
-            if f != "z" or d == 0]  # fmt: skip
-    ranking = conclude(rows).quality.ranking
-    assert ranking.names == ("x", "y") and ranking.left_out == ("z",) and ranking.behind == ("y",)
-    assert any(s.word == "Other data: x leads" for s in conclude(rows).statements)
+    assert conclude(both).models.measure == "simulation_fit"
 
 
 def test_one_simulation_that_runs_away_does_not_decide():
     rows = models({"exact": 0.0, "relaxed": -1.5})
     next(r for r in rows if r["formulation"] == "exact")["simulation_fit"] = -1e9
-    figures = conclude(rows).quality.figures["simulation_fit"]
+    figures = conclude(rows).models.figures["simulation_fit"]
     assert figures["exact"] == pytest.approx((11 * 80 - 100) / 12, abs=5)
 
 
@@ -112,45 +103,37 @@ def test_records_of_one_system_do_not_outvote_another_data_set():
     """Twelve seeds of a simulated system and one measured record are two data sets, not thirteen."""
     rows = sets({"saturation": {"exact": 9, "oe": 0}, "valve": {"exact": 0, "oe": 2}}, {"saturation": 12, "valve": 1})
     verdict = conclude(rows)
-    assert verdict.quality.choice.kind == DEPENDS and verdict.headline.word == "Models depend on the data"
+    assert verdict.models.choice.kind == DEPENDS and verdict.headline.word == "Models depend on the data"
     assert "on saturation oe" in verdict.headline.text and "on valve exact so far" in verdict.headline.text
-    assert verdict.quality.figures["simulation_fit"]["oe"] == pytest.approx(79.0, abs=0.2)  # not of 13 records
+    assert verdict.models.figures["simulation_fit"]["oe"] == pytest.approx(79.0, abs=0.2)  # not of 13 records
     agreeing = conclude(sets({"saturation": {"exact": 9, "oe": 0}, "valve": {"exact": 2, "oe": 0}},
                              {"saturation": 12, "valve": 1}))  # fmt: skip
-    assert agreeing.quality.choice.kind == CANNOT_TELL
-    assert "at least 6 data sets, or 6 records of each" in str(agreeing)
+    assert agreeing.models.choice.kind == CANNOT_TELL
+    assert "at least 6 data sets, or 6 records of each" in agreeing.headline.text
 
 
 def test_of_few_data_sets_each_speaks_for_itself():
     both = {"one": {"x": 0, "y": 3}, "two": {"x": 0, "y": 9}}
     verdict = conclude(sets(both, {"one": 8, "two": 8}))
-    assert verdict.headline.word == "Best models: x" and verdict.quality.choice.tied == ()
-    assert "on each of 2 data sets: on one x" in verdict.headline.text and "; on two x" in verdict.headline.text
+    assert verdict.headline.word == "Best models: x" and verdict.models.choice.tied == ()
     half = conclude(sets({**both, "two": {"x": 0, "y": 0}}, {"one": 8, "two": 8}))
-    assert half.headline.word == "Best models: x" and " tie, a fit of" in half.headline.text
+    assert half.headline.word == "Best models: x"
     against = conclude(sets({**both, "two": {"x": 9, "y": 0}}, {"one": 8, "two": 80}))
-    assert against.quality.choice.kind == DEPENDS and "Best models" not in str(against)
+    assert against.models.choice.kind == DEPENDS and "Best models" not in str(against)
 
 
 def test_of_many_data_sets_each_counts_once():
     losses = {f"set {d}": {"x": 0, "y": 3 + d / 10} for d in range(8)} | {"odd": {"x": 20, "y": 0}}
     records = {name: 2 for name in losses}
-    few = conclude(sets(losses, records)).quality.choice
+    few = conclude(sets(losses, records)).models.choice
     assert few.against["y"].n == 9
-    many = conclude(sets(losses, records | {"odd": 300})).quality.choice
+    many = conclude(sets(losses, records | {"odd": 300})).models.choice
     assert many.kind == few.kind and many.against["y"].value == pytest.approx(few.against["y"].value, abs=0.1)
     del losses["odd"]
     verdict = conclude(sets(losses, records))
     assert verdict.headline.word == "Best models: x" and "8 data sets)" in verdict.headline.text
     reversed_one = conclude(sets(losses | {"set 7": {"x": 1, "y": 0}}, records | {"set 7": 9}))
     assert reversed_one.headline.word == "Best models: x"
-    assert "On set 7 another one is ahead." in reversed_one.headline.text
-
-
-def test_an_unknown_truth_is_said():
-    said = conclude(models({"exact": 0.0, "relaxed": -1.5}, truth=False)).statements
-    assert any(s.word == "Truth unknown" for s in said)
-    assert not any(s.word == "Truth unknown" for s in conclude(models({"exact": 0.0})).statements)
 
 
 # ---- over data sets, and as a whole
@@ -160,16 +143,6 @@ def study_over(sets, factors=(1.0, 3.0, 9.0), seeds=4):
     rng = np.random.default_rng(7)
     return [run("abc"[s], seed, data=f"set {d}", seconds=f * np.exp(0.2 * rng.normal()))
             for d in range(sets) for seed in range(seeds) for s, f in enumerate(factors)]  # fmt: skip
-
-
-def test_seeds_are_no_data_sets():
-    few = conclude(study_over(3, seeds=40)).overall.ranking
-    assert few.n == 3 and few.missing
-    many = conclude(study_over(8)).overall.ranking
-    assert many.n == 8 and many.names == ("a", "b", "c") and many.behind == ("b", "c")
-    said = [s for s in conclude(study_over(8)).statements if s.about == "data sets"]
-    assert said and "8 data sets" in said[0].text
-    assert "at least 7 data sets; there are 3" in str(conclude(study_over(3)))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -203,7 +176,7 @@ def test_a_dominated_solver_changes_no_choice(seed):
 def test_every_sentence_has_its_evidence_in_numbers():
     verdict = conclude(synthetic(3000, 3))
     for statement in (verdict.headline, *verdict.statements):
-        assert any(character.isdigit() for character in statement.text) or statement.word == "Truth unknown"
+        assert any(character.isdigit() for character in statement.text)
         assert statement.tone in ("good", "fair", "bad") and statement.word
 
 
@@ -231,10 +204,9 @@ def test_the_standings_equal_those_of_a_data_frame():
     wide = wide.dropna(how="all").loc[:, lambda w: w.notna().any()]
     section = conclude(rows).overall
     ran = frame[frame.outcome != "refused"].groupby("solver").size()
-    fastest = wide.eq(wide.min(axis=1), axis=0).sum()
     for s in section.standings:
         t = wide[s.solver].dropna()
-        assert (s.solved, s.problems, s.fastest) == (len(t), ran[s.solver], fastest[s.solver])
+        assert (s.solved, s.problems) == (len(t), ran[s.solver])
         assert s.time == pytest.approx(scipy.stats.gmean(t + 0.01) - 0.01)
         if (against := section.choice.against.get(s.solver)) is not None and against.n:
             both = (wide[s.solver] / wide[section.choice.first]).dropna()
@@ -264,12 +236,6 @@ def test_a_verdict_is_frozen_and_prints():
     verdict = conclude(synthetic(200, 1))
     with pytest.raises(dataclasses.FrozenInstanceError):
         verdict.headline = "fit"
-    assert str(verdict).startswith(verdict.headline.word)
+    assert verdict.headline.word in str(verdict)
 
 
-def test_who_beats_the_first_more_often_is_not_behind_it():
-    from optid.studies.verdicts.ranks import rank
-
-    ranks = np.array([[2, 1, 3, 4, 5, 6]] * 60 + [[1, 6, 2, 3, 4, 5]] * 20, dtype=float)
-    found = rank(ranks, np.ones(ranks.shape, bool), tuple("ABCDEF"), np.arange(80))
-    assert found.names[0] == "A" and "B" not in found.behind and "F" in found.behind

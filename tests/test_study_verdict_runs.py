@@ -139,10 +139,9 @@ def test_a_warm_time_counts_only_where_the_warm_solve_was_verified():
     assert conclude(rows).recommended == ("b",)
     verdict = conclude(rows, time="warm")
     assert np.isfinite(verdict.found.time).sum(axis=0).tolist() == [7, 9]
-    assert verdict.recommended == ("a",) and "b, solved 9, no difference beyond chance" in verdict.headline.text
+    assert verdict.recommended == ("a",) and "b, solved 9 and takes" in verdict.headline.text
     a = verdict.overall.standing("a")
     assert (a.solved, a.problems, a.failures) == (7, 9, {"warm solve failed": 2})
-    assert a.penalised == pytest.approx(np.exp(np.mean(np.log(np.array([0.1] * 7 + [60.0] * 2) + 0.01))) - 0.01)
     cold = conclude(table_of(times_of(1.0, 2.0)), time="warm")
     assert "warm = true" not in str(verdict)
     procedures = [run("a", p, formulation="steps", seconds=1.0) for p in range(9)]
@@ -155,7 +154,7 @@ def test_problems_that_all_agree_to_be_infeasible_are_taken_out_and_said():
     rows += [run(s, 9, status_verified="infeasible", objective=None) for s in "ab"]
     verdict = conclude(rows)
     assert verdict.overall.infeasible == 1 and len(verdict.overall.found.data) == 8
-    assert not verdict.false_claims and "1 problem has no solution according to 2 of 2 solvers" in str(verdict)
+    assert not verdict.false_claims and any(s.text.startswith("1 problem has no solution") for s in verdict.statements)
 
 
 def infeasible(solver, problem):
@@ -180,10 +179,10 @@ def test_who_crashes_on_a_problem_without_a_solution_has_failed_on_it_all_the_sa
     rows = [run(s, p) for s in "abc" for p in range(8)]
     rows += [infeasible("a", 8), infeasible("b", 8), dead("c", 8, "crashed")]
     verdict = conclude(rows)
-    assert verdict.overall.infeasible == 1 and "according to 2 of 3 solvers" in str(verdict)
+    assert verdict.overall.infeasible == 1
     a, c = verdict.overall.standing("a"), verdict.overall.standing("c")
     assert (a.problems, a.solved, a.failures) == (8, 8, {})
-    assert (c.problems, c.solved, c.failures) == (9, 8, {"crashed": 1}) and c.penalised > a.penalised
+    assert (c.problems, c.solved, c.failures) == (9, 8, {"crashed": 1})
 
 
 # ---- what is given
@@ -207,7 +206,7 @@ def test_studies_of_one_database_are_kept_apart():
     rows = table_of(times_of(1.0, 3.0, problems=4)) + [
         {**row, "study": "other", "objective": 2.0} for row in table_of(times_of(1.0, 3.0, problems=4, seed=1))]
     verdict = conclude(rows)
-    assert len(verdict.found.data) == 8 and verdict.found.solved.all() and verdict.overall.ranking.n == 2
+    assert len(verdict.found.data) == 8 and verdict.found.solved.all()
 
 
 @pytest.mark.parametrize(

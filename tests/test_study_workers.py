@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import deque
 from pathlib import Path
 
 import psutil
@@ -17,13 +16,13 @@ from processes import cell_workers, gone, wait_for
 from study_trouble import behave, cell
 
 from optid.errors import StudyError
-from optid.studies.execution.workers import Pool, execute
+from optid.studies.execution.executors import run_here
 from optid.studies.storage.rows import NAMES
 
 
 def by_key(cells, **settings):
     """Rows by number of the cell; every cell has exactly one."""
-    rows = list(execute(cells, behave, **settings))
+    rows = list(run_here(cells, behave, **{"workers": 2, **settings}))
     found = {int(row["key"], 16): row for row in rows}
     assert len(rows) == len(cells) == len(found) and set(found) == {int(c.key, 16) for c in cells}
     assert all(tuple(row) == NAMES for row in rows)
@@ -61,16 +60,14 @@ def test_a_worker_that_fails_is_a_row_and_the_next_cell_runs():
             assert rows[k - 1]["unknowns"] == rows[k + 1]["unknowns"]
 
 
-def test_a_worker_that_dies_between_cells_is_no_fault_of_the_next_cell():
-    pool = Pool(behave, 1)
-    try:
-        (first,) = pool.run(deque([cell(0)]))
-        os.kill(first["unknowns"], signal.SIGKILL)
-        wait_for(lambda: gone(first["unknowns"]))
-        (second,) = pool.run(deque([cell(1)]))
-    finally:
-        pool.close()
-    assert second["outcome"] == "done" and second["unknowns"] != first["unknowns"]
+def test_a_worker_that_is_killed_from_outside_says_so(tmp_path):
+    rows = run_here([cell(0), cell(1, seconds=600.0)], behave, workers=1)
+    first = next(rows)
+    wait_for(lambda: any(pid == first["unknowns"] for pid in cell_workers(os.getpid())))
+    time.sleep(0.5)
+    os.kill(first["unknowns"], signal.SIGKILL)
+    (second,) = rows
+    assert second["outcome"] == "killed" and "killed from outside (signal SIGKILL)" in second["reason"]
 
 
 @pytest.mark.parametrize("then, words", [("abort", "the worker died: signal SIGABRT"), ("raise", "no such thing"),
@@ -120,7 +117,7 @@ def test_a_worker_that_crashes_leaves_no_core_file():
         pytest.skip("this process may not leave core files in the first place")
     resource.setrlimit(resource.RLIMIT_CORE, (largest, largest))
     try:
-        (row,) = execute([cell(0, "cores")], behave)
+        (row,) = run_here([cell(0, "cores")], behave, workers=1)
     finally:
         resource.setrlimit(resource.RLIMIT_CORE, (before, largest))
     assert row["iterations"] == 0
@@ -153,7 +150,7 @@ def test_a_cell_that_cannot_be_sent_is_a_row():
 
 
 def test_closing_ends_the_workers_at_once():
-    rows = execute([cell(0), cell(1, "loop"), cell(2, "loop")], behave, workers=2)
+    rows = run_here([cell(0), cell(1, "loop"), cell(2, "loop")], behave, workers=2)
     pid = next(rows)["unknowns"]
     assert pid in cell_workers(os.getpid())
     clock = time.monotonic()
@@ -167,8 +164,8 @@ def test_workers_die_with_a_parent_that_is_killed(tmp_path):
 import sys
 sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
 from study_trouble import behave, cell
-from optid.studies.execution.workers import execute
-for row in execute([cell(0), cell(1), cell(2, "stuck"), cell(3, "stuck")], behave, workers=2):
+from optid.studies.execution.executors import run_here
+for row in run_here([cell(0), cell(1), cell(2, "stuck"), cell(3, "stuck")], behave, workers=2):
     print(row["unknowns"], flush=True)
 """
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
@@ -181,24 +178,14 @@ for row in execute([cell(0), cell(1), cell(2, "stuck"), cell(3, "stuck")], behav
     wait_for(lambda: all(map(gone, children)))
 
 
-@pytest.mark.parametrize("missing, error, words", [
-    ("pebble", StudyError, "pip install 'optid"), ("pebble.pool.channel", ModuleNotFoundError, "pebble.pool.channel")])
-def test_only_a_missing_pebble_is_said_to_be_missing(monkeypatch, missing, error, words):
-    for name in [name for name in sys.modules if name.partition(".")[0] == "pebble"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(error, match=words):
-        Pool(behave, 1)
-
-
 def test_no_guard_of_the_main_module_is_needed(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(f"""
 import sys
 sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
 from study_trouble import behave, cell
-from optid.studies.execution.workers import execute
-print("once", [row["outcome"] for row in execute([cell(0)], behave)])
+from optid.studies.execution.executors import run_here
+print("once", [row["outcome"] for row in run_here([cell(0)], behave, workers=1)])
 """)
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=600)
     assert done.stdout == "once ['done']\n", done.stderr
@@ -206,14 +193,14 @@ print("once", [row["outcome"] for row in execute([cell(0)], behave)])
 
 def test_a_function_without_a_name_is_refused():
     with pytest.raises(StudyError, match="workers cannot import"):
-        list(execute([cell(0)], lambda cell: {}))
+        list(run_here([cell(0)], lambda cell: {}, workers=1))
 
 
 def test_workers_that_do_not_start_are_an_error_with_their_last_words(monkeypatch):
-    monkeypatch.setattr("optid.studies.execution.workers.prepare", study_trouble.fail_to_start)
-    monkeypatch.setattr("optid.studies.execution.workers.run_cell", behave)
-    with pytest.raises(StudyError, match="before they were ready, 3 times in a row: ModuleNotFoundError"):
-        list(execute([cell(0)], behave))
+    monkeypatch.setattr("optid.studies.execution.apart.prepare", study_trouble.fail_to_start)
+    monkeypatch.setattr("optid.studies.execution.apart.run_cell", behave)
+    with pytest.raises(StudyError, match="before it was ready: ModuleNotFoundError"):
+        list(run_here([cell(0)], behave, workers=1))
 
 
 def test_a_path_object_in_the_search_path_is_no_obstacle(monkeypatch):
@@ -223,5 +210,5 @@ def test_a_path_object_in_the_search_path_is_no_obstacle(monkeypatch):
 
 def test_nothing_to_do_starts_nobody():
     before = set(psutil.Process().children())
-    assert list(execute([], behave)) == []
+    assert list(run_here([], behave, workers=1)) == []
     assert set(psutil.Process().children()) <= before

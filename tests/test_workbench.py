@@ -28,7 +28,7 @@ from optid.errors import DataError, StructureError
 from optid.examples import example
 from optid.models import HammersteinSS
 from optid.workbench import views
-from optid.workbench.bench import Bench, Source
+from optid.workbench.bench import Bench, BenchSource
 from optid.workbench.request import ChosenConstraint, Request, suggested
 from optid.workbench.server import PAGES, Server, serve
 
@@ -38,7 +38,7 @@ ARGUMENTS = {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:10"}
 def source(name="thruster", **options):
     chosen = example(name, **options)
     words = "".join(f", {key}={value!r}" for key, value in options.items())
-    return Source(chosen.data, f"optid.examples.example({name!r}{words}).data",
+    return BenchSource(chosen.data, f"optid.examples.example({name!r}{words}).data",
                   suggested(chosen.data, chosen.suggestion))
 
 
@@ -152,7 +152,7 @@ def test_the_script_repeats_the_numbers(constraints):
 def test_every_experiment_is_fitted_as_a_whole():
     record = two_by_two().select(outputs="level_a", inputs="valve <1>")
     state = {**suggested(record, {}), "constraints": []}
-    bench = Bench(Source(record, "record", state))
+    bench = Bench(BenchSource(record, "record", state))
     shown = bench.answer("fit", {"state": state})
     assert "experiment 1 of 3" in shown["time"][0]["title"]
     third = bench.answer("time", {"state": state, "experiment": 2})
@@ -170,7 +170,7 @@ def test_curves_are_drawn_for_the_output_chosen():
     state = {**suggested(record, {}), "formulation": "hammerstein_ss.sivid",
              "arguments": {"nx": 2, "basis": "triangular:5"}, "constraints": []}
     state = constrained(state, ("through", {"u": 0.2, "y": 0.5, "channel": "valve <1>", "output": 'temp "b"'}, "point"))
-    bench = Bench(Source(record, "record", state))
+    bench = Bench(BenchSource(record, "record", state))
     first, second = (bench.answer("fit", {"state": state, "output": name})["charts"][0] for name in record.outputs)
     assert (first["output"], second["output"]) == record.outputs and first["title"] != second["title"]
     assert second["y"]["title"] == 'temp "b" (°C)'
@@ -264,7 +264,7 @@ def test_a_model_without_an_equilibrium_has_no_static_characteristic(monkeypatch
     state = {**suggested(chosen.data, {}), "formulation": "hammerstein_ss.asivid",
              "arguments": {"nx": 2, "basis": "triangular:5"}}
     for tools in ({"static", "step"}, {"step"}):
-        found = Bench(Source(chosen.data, "record", state)).answer("fit", {"state": state})
+        found = Bench(BenchSource(chosen.data, "record", state)).answer("fit", {"state": state})
         assert {chart["tool"] for chart in found["charts"]} & {"static", "step"} == tools
         monkeypatch.setattr(HammersteinSS, "static_curve", nowhere)
 
@@ -272,7 +272,7 @@ def test_a_model_without_an_equilibrium_has_no_static_characteristic(monkeypatch
 def test_faults_may_be_taken_out():
     chosen = example("broken_thruster")
     model = optid.fit(example("thruster").data, "hammerstein_ss.asivid", nx=2, basis="triangular:10").model
-    bench = Bench(Source(chosen.data, "", suggested(chosen.data, chosen.suggestion), model))
+    bench = Bench(BenchSource(chosen.data, "", suggested(chosen.data, chosen.suggestion), model))
     found, loss = bench.answer("diagnose", {"window": [0, 400]}), "actuator:current loss"
     assert found["word"].startswith("faulty") and found["answers"][0][0] == loss
     less = bench.answer("diagnose", {"window": [0, 400], "without": [loss]})
@@ -385,7 +385,7 @@ def test_the_page_offers_what_the_formulation_accepts(bench_page):
         data = record.select(outputs=list(record.outputs[:outputs]))
         state = {**suggested(data, {}), "formulation": name, "arguments": arguments, "constraints": []}
         browser.run(f"void (state = {json.dumps(state)})")
-        bench = Bench(Source(data, "", state))
+        bench = Bench(BenchSource(data, "", state))
         for word in words:
             more = {"output": data.outputs[-1]} if outputs > 1 and word in ("through", "range", "step_band") else {}
             found = bench.answer("fit", {"state": constrained(state, (word, {**RULES[word], **more}, word))})
@@ -460,7 +460,7 @@ def test_experiment_and_output_are_chosen(tmp_path):
     start = {**suggested(record, {}), "formulation": "hammerstein_ss.sivid",
              "arguments": {"nx": 2, "basis": "triangular:5"}}
     titles = "[...document.querySelectorAll('#plots figure h3')].map((e) => e.textContent)"
-    with served(Source(record, "", start)) as server, Browser(tmp_path) as browser:
+    with served(BenchSource(record, "", start)) as server, Browser(tmp_path) as browser:
         goto(browser, server)
         before = browser.run(titles)
         assert before[0] == "Output level_a, experiment 1 of 3"
@@ -485,7 +485,7 @@ def test_a_dated_record_shows_dates_and_samples_of_the_whole(tmp_path):
     data = optid.Data(data.u, data.y, 60.0, "current", "thrust", start="2024-05-01T06:00").mapped(
         lambda u: u, lambda y: y, findings=("clock 't': in min, read as seconds",))
     start = suggested(data, {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:4"})
-    with served(Source(data, "data", {**start, "window": [100, 500]})) as server, Browser(tmp_path) as browser:
+    with served(BenchSource(data, "data", {**start, "window": [100, 500]})) as server, Browser(tmp_path) as browser:
         goto(browser, server)
         assert browser.run("document.querySelector('main section').textContent").split("read")[0].endswith("in min, ")
         assert browser.run(OVERLAPS) == []
@@ -530,7 +530,7 @@ def test_a_page_diagnoses_and_asks_what_if(tmp_path):
     start = suggested(chosen.data, chosen.suggestion)
     start |= {"formulation": "hammerstein_ss.asivid", "arguments": {"nx": 2, "basis": "triangular:10"},
               "window": [0, 240], "constraints": []}
-    with served(Source(chosen.data, "", start)) as server, Browser(tmp_path) as browser:
+    with served(BenchSource(chosen.data, "", start)) as server, Browser(tmp_path) as browser:
         goto(browser, server)
         browser.click("#diagnose")
         browser.wait("document.documentElement.dataset.diagnosed")

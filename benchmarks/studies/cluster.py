@@ -32,7 +32,6 @@ import optid
 from optid.models.layout import Layout
 from optid.statistics.regression import collect
 from optid.studies import Study
-from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.execution import running
 from optid.studies.storage import store
 from optid.studies.storage.rows import BY_NAME, NAMES
@@ -93,15 +92,14 @@ def different(here: dict[str, Any], there: dict[str, Any]) -> set[str]:
 def compare_rows(client: Any, seeds: int, folder: Path) -> bool:
     study = Study(
         name="one machine against a cluster", seeds=tuple(range(seeds)), time_limit=120.0,
-        data=(DataEntry("rig", system="dead_zone", samples=(200, 400), noise=(0.1,)),),
-        formulations=tuple(FormulationEntry(label, name, options=options, constraints=rules)
-                           for label, (name, options, rules) in FORMULATIONS.items()),
-        solvers=tuple(SolverEntry(name, name) for name in SOLVERS))
+        data={"system": "dead_zone", "samples": [200, 400], "noise": 0.1}, solvers=SOLVERS,
+        formulations={label: {"formulation": name, "constraints": rules, **options}
+                      for label, (name, options, rules) in FORMULATIONS.items()})
     clock = time.perf_counter()
     here = rows_of(study, folder / "here.sqlite")
     between = time.perf_counter()
     with Killer(client, (8.0, 15.0), most=6) as killer:
-        there = rows_of(study, folder / "there.sqlite", scheduler=client)
+        there = rows_of(study, folder / "there.sqlite", executor=client.get_executor())
     end = time.perf_counter()
     outcomes = {word: sum(row["outcome"] == word for row in here.values())
                 for word in sorted({str(row["outcome"]) for row in here.values()})}

@@ -25,10 +25,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from optid.studies.definition.description import Study
 from optid.studies.execution.machine import machine
 from optid.studies.grid import cells
 from optid.studies.storage.store import finished, read_rows
+from optid.studies.study import Study
 
 STUDY = """
 name = "six hundred cells"
@@ -99,7 +99,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("optid", "pebble", "numpy"))
+    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("optid", "numpy"))
     print(f"{machine()}; {versions}")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "study.toml"

@@ -26,10 +26,12 @@ from pathlib import Path
 import numpy as np
 
 from optid.data.reduction import available_cores
-from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
-from optid.studies.execution import running, workers
+from optid.studies.definition import DataEntry, FormulationEntry, SolverEntry
+from optid.studies.execution import running
 from optid.studies.execution.cell import run_cell
+from optid.studies.execution.executors import run_here
 from optid.studies.grid import cells
+from optid.studies.study import Study
 
 HAMMERSTEIN = {"na": 2, "nb": 2, "basis": "triangular:8"}
 QUICK = (("hammerstein_arx.exact", "gauss_newton", HAMMERSTEIN), ("hammerstein_arx.exact", "ipopt", HAMMERSTEIN),
@@ -62,7 +64,7 @@ def watched(described: Study, number: int) -> tuple[list[tuple[float, dict]], fl
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
         running.run(described, Path(folder) / "study.sqlite", progress=progress,
-                    execute=partial(workers.execute, workers=number))
+                    execute=partial(run_here, workers=number))
         return came, started, time.perf_counter()
 
 

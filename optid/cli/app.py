@@ -15,10 +15,10 @@ from optid.cli.look import look
 from optid.cli.monitoring import monitor
 from optid.cli.options import register
 from optid.cli.studies import study
-from optid.cli.terminal import Command, Group, print_text
+from optid.cli.terminal import Command, CommandGroup, print_text
 
 app = typer.Typer(
-    cls=Group,
+    cls=CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -49,8 +49,8 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
 
     import_cvxpy()
     from optid.errors import StudyError
-    from optid.studies.definition.description import Study
     from optid.studies.execution import running
+    from optid.studies.study import Study
     from optid.studies.verdicts.comparison import compare as side_by_side
     from optid.studies.verdicts.comparison import verdict_on_one_record
 
@@ -82,9 +82,7 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
     if assumed:
         note(f"{', '.join(f'{key} = {value}' for key, value in assumed.items())} assumed; optid order selects orders")
     if report is not None:
-        from optid.studies.page import write_page
-
-        write_page(verdict_on_one_record(rows), report, command=command_line())
+        verdict_on_one_record(rows).report(report, command=command_line())
         print_text(f"report written to {report}")
     if not found.lines:
         raise typer.Exit(NOTHING_SOLVED)
@@ -115,8 +113,9 @@ def _as_options(text: str) -> str:
 
 def _show(found: Any, formulation: str, record: str) -> None:
     from optid.backends.choice import back_ends
+    from optid.phrases import seconds
     from optid.program.solution import GRADIENT
-    from optid.show.wording import number, seconds
+    from optid.show.wording import number
     from optid.studies.verdicts.choice import listed
     from optid.studies.verdicts.outcomes import SOLVED
 

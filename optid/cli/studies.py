@@ -44,9 +44,9 @@ def run(file: File = None, example: bool = False, db: File = None, workers: Work
         dry_run: List the cells that would be run, without running them.
     """
     from optid.errors import StudyError
-    from optid.studies.definition.description import Study
     from optid.studies.execution import running
     from optid.studies.storage import export as exporting
+    from optid.studies.study import Study
 
     if (file is None) != example:
         raise StudyError("give a study file, or --example for a built-in study" + (", not both" if example else ""))
@@ -58,8 +58,8 @@ def run(file: File = None, example: bool = False, db: File = None, workers: Work
     if dry_run:
         _plan(described, db, accept_changed_data=accept_changed_data, retry=retry or ())
         return
-    with follow_progress(db, described) as follow:
-        running.run(described, db, workers=workers, scheduler=scheduler, progress=follow,
+    with _executor(scheduler) as executor, follow_progress(db, described) as follow:
+        running.run(described, db, workers=workers, executor=executor, progress=follow,
                     accept_changed_data=accept_changed_data, retry=retry or ())
     solved = _summary(db, described.name)
     if export is not None:
@@ -67,6 +67,18 @@ def run(file: File = None, example: bool = False, db: File = None, workers: Work
         print_text(f"{count} rows written to {export}")
     if not solved:
         raise typer.Exit(NOTHING_SOLVED)
+
+
+@contextmanager
+def _executor(scheduler: str | None) -> Iterator[Any]:
+    """Give the executor of a Dask cluster; None where none is asked for."""
+    if scheduler is None:
+        yield None
+        return
+    from optid.data.clusters import connected
+
+    with connected(scheduler) as client:
+        yield client.get_executor()
 
 
 def report(db: Path, page: File = None, title: str | None = None, accuracy: float | None = None, clock: str = "solve"
@@ -80,20 +92,30 @@ def report(db: Path, page: File = None, title: str | None = None, accuracy: floa
         accuracy: Relative accuracy of the comparison. [dim]that of most cells[/]
         clock (--time WORD): Time compared: solve (cold), fit (whole fit) or warm.
     """
-    from optid.cli.study_summary import print_former, print_models, print_reasons
-    from optid.studies.page import write_page
     from optid.studies.storage.store import rows_of_one
     from optid.studies.verdicts.verdict import conclude
 
     check_folders(page)
     verdict = conclude(rows_of_one(db, title), accuracy=accuracy, time=clock)
     print_text(str(verdict))
-    print_models(verdict)
-    print_reasons(verdict.table)
-    print_former(db, title)
+    _print_superseded(db, title)
     if page is not None:
-        write_page(verdict, page, command=command_line())
+        verdict.report(page, command=command_line())
         print_text(f"report written to {page}")
+
+
+def _print_superseded(db: Path, study: str | None) -> None:
+    """Print the number of superseded rows in a database."""
+    from optid.studies.storage.store import Store
+
+    if db.suffix == ".parquet":
+        return
+    with Store(db) as store:
+        count = sum(store.superseded(study).values())
+    if count:
+        rows, stay = ("row", "is") if count == 1 else ("rows", "are")
+        print_text(Text(f"{count:,} {rows} of former entries, data, settings or versions, or of cells that were run "
+                        f"again, {stay} kept in {db} (table superseded) and in no report", "dim"))
 
 
 def export(db: Path, target: Path, title: str | None = None) -> None:
@@ -207,24 +229,18 @@ def _plan(described: Any, db: Path, **settings: Any) -> None:
 
 
 def _summary(db: Path, name: str) -> bool:
-    """Print outcomes by solver, reasons and the headline of the verdict; return whether any cell was solved."""
+    """Print the verdict of a study and how to get its page; return whether any cell has an answer."""
     import shlex
 
     import numpy as np
 
-    from optid.cli import study_summary as summary
     from optid.program.solution import Status
     from optid.studies.storage.store import read_rows
     from optid.studies.verdicts.verdict import conclude
 
     every = read_rows(db)
     rows = {column: values[every["study"] == name] for column, values in every.items()}
-    summary.print_outcomes(name, rows)
-    summary.print_reasons(rows)
-    verdict = conclude(rows)
-    summary.print_models(verdict)
-    headline = verdict.headline
-    print_text(Text.assemble((f"{headline.word}: ", "bold"), headline.text))
+    print_text(str(conclude(rows)))
     words = ["optid", "study", "report", str(db), "-o", f"{db.stem}.html"]
     words += ["--study", name] if len(rows["key"]) < len(every["key"]) else []
     print_text(Text(shlex.join(words), "dim"))

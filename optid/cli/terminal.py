@@ -46,7 +46,7 @@ class Command(TyperCommand):
             raise typer.Exit(exit_code(error)) from None
 
 
-class Group(TyperGroup):
+class CommandGroup(TyperGroup):
     """The commands; `--debug` may come anywhere."""
 
     def main(self, *args: Any, **settings: Any) -> Any:

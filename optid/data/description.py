@@ -15,7 +15,7 @@ RECORD = "The record"  # their heading
 
 
 @dataclass(frozen=True, repr=False)
-class Description:
+class DataDescription:
     """What `Data.describe` returns; printing it shows a table.
 
     Attributes:

@@ -17,7 +17,7 @@ from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.rival_clocks import settle
 from optid.data.reading.runs import RawRun, cut_between, join_continued, sample_evenly
-from optid.data.reading.sources import Table, open_tables
+from optid.data.reading.sources import RawTable, open_tables
 from optid.data.record import Data, Experiment
 from optid.data.streams import Stream, open_stream
 from optid.errors import DataError
@@ -96,7 +96,7 @@ def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float |
     )
 
 
-def _runs_of(tables: Sequence[Table], inputs: Wanted, outputs: Wanted, time: Any, experiment: Any) -> list[RawRun]:
+def _runs_of(tables: Sequence[RawTable], inputs: Wanted, outputs: Wanted, time: Any, experiment: Any) -> list[RawRun]:
     """Return the experiments of a source; of several tables those that have all channels."""
     if len(tables) == 1:
         return _runs(tables[0], inputs, outputs, time, experiment)
@@ -113,7 +113,7 @@ def _runs_of(tables: Sequence[Table], inputs: Wanted, outputs: Wanted, time: Any
     return [run for table in whole for run in _runs(table, inputs, outputs, time, experiment)]
 
 
-def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: str | int | None) -> list[RawRun]:
+def _runs(table: RawTable, inputs: Wanted, outputs: Wanted, time: Any, experiment: str | int | None) -> list[RawRun]:
     label, how = table.label, table.how
     inputs = table.inputs if inputs is None else inputs
     outputs = table.outputs if outputs is None else outputs
@@ -169,7 +169,7 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
     return runs
 
 
-def _clock(table: Table, loaded: Mapping[str, Any], clocks: Sequence[str], time: Any
+def _clock(table: RawTable, loaded: Mapping[str, Any], clocks: Sequence[str], time: Any
            ) -> tuple[TimeColumn | None, np.ndarray | None, list[str]]:
     """Return the clock of a table, its stamps and what is to be said of it."""
     if not clocks:
@@ -182,7 +182,7 @@ def _clock(table: Table, loaded: Mapping[str, Any], clocks: Sequence[str], time:
         raise DataError(f"{error.cause} Pass {table.advice}.") from None
 
 
-def _numeric(loaded: Mapping[str, Any], column: str, table: Table) -> Any:
+def _numeric(loaded: Mapping[str, Any], column: str, table: RawTable) -> Any:
     """Return the samples of a column, texts converted to numbers and marks of missing samples to NaN."""
     values = loaded[column]
     array = np.asarray(values) if not isinstance(values, np.ma.MaskedArray) else values
@@ -196,7 +196,7 @@ def _numeric(loaded: Mapping[str, Any], column: str, table: Table) -> Any:
     return known.without_marks(array, table.how) if array.dtype.kind in "iuf" else values
 
 
-def _stacked(pairs: dict[str, str], loaded: dict[str, Any], table: Table, quality: Mapping[str, str],
+def _stacked(pairs: dict[str, str], loaded: dict[str, Any], table: RawTable, quality: Mapping[str, str],
              good: Mapping[str, np.ndarray], kept: Set[str] = frozenset()) -> tuple[tuple[str, ...], np.ndarray]:
     """Return names and samples (N, channels), read-only; all columns but those kept make room for their copies."""
     names: list[str] = []

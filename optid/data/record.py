@@ -11,7 +11,7 @@ import numpy as np
 from optid.arrays import as_list, as_records, frozen, import_pandas, one_or_all
 from optid.data import preprocessing
 from optid.data.channels import Channel, Ports, Transform, channel_fields, interval_text, listed, sampling_time
-from optid.data.description import Description, instant
+from optid.data.description import DataDescription, instant
 from optid.data.timeline import Timeline, read_times, seconds_of, starts_of
 from optid.errors import DataError, nearest
 from optid.phrases import plural
@@ -241,11 +241,11 @@ class Data(Ports):
         units = "" if self.transform.is_identity else "\n  detrended or scaled; reports are in raw units"
         return f"{self.describe()}{units}"
 
-    def describe(self) -> Description:
+    def describe(self) -> DataDescription:
         """Return range, mean, distinct levels and missing samples of each channel, and how it is sampled."""
         ends = [line.instants([0, e.n_samples - 1]) for line, e in zip(self.timelines, self.experiments)]
-        return Description(self.name, self.interval, tuple(e.n_samples for e in self.experiments),
-                           tuple((a, b) for a, b in ends), self.channels, self.findings)
+        return DataDescription(self.name, self.interval, tuple(e.n_samples for e in self.experiments),
+                               tuple((a, b) for a, b in ends), self.channels, self.findings)
 
     def _repr_html_(self) -> str:
         return render(self, "html")

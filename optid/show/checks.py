@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.models.functions import static_functions
-from optid.phrases import p_value
-from optid.show.wording import Table, number, percent, seconds
+from optid.phrases import p_value, seconds
+from optid.show.wording import Table, number, percent
 
 if TYPE_CHECKING:
     from optid.identify.search import Identification

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid import phrases
 from optid.data.description import RECORD
 from optid.data.record import Data
 from optid.errors import DataError
@@ -172,7 +173,7 @@ def _optimum(fit: "Fit") -> list[Any]:
     cards = [("relative gap to the bound", "none" if solution.bound is None else wording.gap_text(solution.gap))]
     if fit.prices:
         cards.append(("constraints active", f"{sum(p.binding for p in fit.prices)} of {len(fit.prices)}"))
-    cards.append(("time", wording.seconds(fit.seconds)))
+    cards.append(("time", phrases.seconds(fit.seconds)))
     right = [(name, value) for name, value in summary.certificate_facts(fit)
              if name in ("Objective", "Bound", "Relative gap")]
     right += [(name, value) for name, value in summary.solver_facts(fit) if name in ("Solver", "Iterations", "Total")]
@@ -251,7 +252,7 @@ def _search(found: "Identification") -> list[Any]:
     table = wording.Table(f"Every structure that was tried on all blocks ({len(trials)})",
                           ("structure", "fit %", "worst block", "parameters", "time"),
                           [(f"{t.candidate.kind}: {t.candidate.formulation} {t.candidate.words}", f"{t.score:.1f}",
-                            checks.worst_block(t), str(t.parameters), wording.seconds(t.seconds))
+                            checks.worst_block(t), str(t.parameters), phrases.seconds(t.seconds))
                            for t in sorted(trials, key=lambda t: -t.score)])
     drawn = [Charts([charts.block_chart(found)])] if found.chosen.by_block.size else []
     return [checks.search_table(found), Notes([*found.reasons, *notes]),

@@ -15,9 +15,10 @@ from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT
 from optid.models.functions import has_feedback, runs_free, static_functions
 from optid.models.kalman import NoiseCovariances
 from optid.models.roots import in_words
+from optid.phrases import seconds
 from optid.program.solution import Solution, Status
 from optid.show.sections import Facts
-from optid.show.wording import Table, gap_text, number, percent, seconds
+from optid.show.wording import Table, gap_text, number, percent
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit

@@ -44,8 +44,3 @@ def percent(values: Any) -> str:
 def gap_text(gap: float) -> str:
     """Write a relative gap; a dash where there is no bound."""
     return "-" if not np.isfinite(gap) else f"{gap:.1e}" if gap else "0"
-
-
-def seconds(value: float) -> str:
-    """Write a time in the unit that suits it; a dash where there is none."""
-    return "-" if np.isnan(value) else f"{1e3 * value:.3g} ms" if value < 0.9995 else f"{value:.3g} s"

@@ -6,10 +6,9 @@ A leaf: nothing in optid imports it but the command line and the public name `op
 from optid.lazy import on_first_use
 
 _HOME = {
-    "definition.description": ["Study"],
+    "study": ["Study"],
     "grid": ["Cell"],
     "verdicts.verdict": ["conclude", "Verdict"],
-    "page": ["write_page"],
 }
 
 __getattr__, __dir__ = on_first_use(__name__, _HOME)

@@ -16,7 +16,7 @@ import numpy as np
 from optid.backends.choice import AUTO, back_ends, find
 from optid.errors import SolverMissing, StudyError
 from optid.registry import FORMULATIONS, registered
-from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
+from optid.studies.definition import DataEntry, Definition, FormulationEntry, SolverEntry
 from optid.studies.sources.systems import system
 
 KEY_VERSION = 1  # part of every key, to be increased if the meaning of keys changes
@@ -57,18 +57,17 @@ class Cell:
         return self.key, self.repetition
 
 
-def cells(study: Study) -> list[Cell]:
+def cells(study: Definition) -> list[Cell]:
     """Return the cells of a study: data x formulations x solvers x accuracies x seeds x repetitions.
 
     Cells of one record and formulation are neighbours, so that a worker need not load it again. A solver that is not
     installed, or does not take the formulation, still has rows, with the reason.
 
     Raises:
-        StudyError: more cells than `MOST`, unreadable data files, or entries that differ only in their labels.
+        StudyError: more cells than `MOST`, a file that cannot be read, or entries that differ only in their labels.
     """
     if (count := number_of_cells(study)) > MOST:
         raise StudyError(f"study {study.name!r} has {count:,} cells; at most {MOST:,} are allowed: split it")
-    study.check_data()
     entries = [located(entry, study.folder) for entry in study.data]
     try:
         contents = [content_hash(entry) for entry in entries]
@@ -91,7 +90,7 @@ def cells(study: Study) -> list[Cell]:
     return found
 
 
-def number_of_cells(study: Study) -> int:
+def number_of_cells(study: Definition) -> int:
     """Return the number of cells of a study."""
     count = 0
     for entry in study.data:
@@ -115,7 +114,7 @@ def check_unchanged(all_cells: Iterable[Cell], hashes: Mapping[tuple[str, str], 
 
 def located(entry: DataEntry, folder: Path) -> DataEntry:
     """Return an entry with absolute file names."""
-    return replace(entry, files=tuple(str((folder / name).resolve()) for name in entry.files))
+    return replace(entry, files=tuple(str((folder / name).resolve()) for name in entry.files)) if entry.files else entry
 
 
 def content_hash(entry: DataEntry) -> str:
@@ -151,7 +150,7 @@ def _records(entry: DataEntry, seeds: tuple[int, ...]) -> Iterable[_Simulated]:
     return product(entry.samples or (own.samples,), entry.noise or (own.noise,), seeds)
 
 
-def _cell(study: Study, entry: DataEntry, content: str, record: _Simulated, formulation: FormulationEntry,
+def _cell(study: Definition, entry: DataEntry, content: str, record: _Simulated, formulation: FormulationEntry,
           solver: SolverEntry, accuracy: float) -> Cell:
     """Return the first repetition of a cell."""
     samples, noise, seed = record

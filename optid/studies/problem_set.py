@@ -20,11 +20,11 @@ from optid.core.program import Program, programme_of
 from optid.errors import OptidError, StudyError
 from optid.program.solution import Solution, Status
 from optid.solving.solve import solve
-from optid.studies.definition.description import Study
-from optid.studies.definition.trial import posed
 from optid.studies.grid import Cell, cells
-from optid.studies.sources.records import load
+from optid.studies.records import load
 from optid.studies.storage.store import Store
+from optid.studies.study import Study
+from optid.studies.trial import build_problem
 
 ACCURACY = 1e-9  # at which objectives are verified
 
@@ -94,7 +94,7 @@ def _programmes(cell: Cell) -> list[tuple[Program, Solution]]:
     found: list[tuple[Program, Solution]] = []
     with warnings.catch_warnings(), suppress(StopIteration, OptidError, ArithmeticError, np.linalg.LinAlgError):
         warnings.simplefilter("ignore")  # the row of the cell has the reason of a failure
-        problem = programme_of(posed(cell.formulation_name, load(cell).data, cell.constraints, cell.options))
+        problem = programme_of(build_problem(cell.formulation_name, load(cell).data, cell.constraints, cell.options))
         program = problem if isinstance(problem, Program) else programme_of(next(problem))
         while True:
             solution = solve(program, accuracy=ACCURACY, time_limit=cell.time_limit, prove=False)

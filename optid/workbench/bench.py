@@ -24,7 +24,7 @@ SOLVING = threading.Lock()
 
 
 @dataclass(frozen=True)
-class Source:
+class BenchSource:
     """A record, the expression of Python that reads it, and the state a page begins with."""
 
     data: Data
@@ -37,7 +37,7 @@ class Source:
 class Bench:
     """The fits of one page; no other page can reach them."""
 
-    source: Source
+    source: BenchSource
     fits: "OrderedDict[str, tuple[Any, Any]]" = field(default_factory=OrderedDict)
     moving: tuple[str, Any] = ("", None)  # last fit of a band being dragged, by the key without the band
 

@@ -23,7 +23,7 @@ from optid import __version__
 from optid.data.description import RECORD, first_findings
 from optid.errors import DataError, OptidError
 from optid.registry import FORMULATIONS, registered
-from optid.workbench.bench import Bench, Source
+from optid.workbench.bench import Bench, BenchSource
 from optid.workbench.request import shortest
 
 PAGES = 16
@@ -48,7 +48,7 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, source: Source, port: int = 0) -> None:
+    def __init__(self, source: BenchSource, port: int = 0) -> None:
         super().__init__(("127.0.0.1", port), _Handler)
         self.source, self.token = source, secrets.token_urlsafe(24)
         self.benches: OrderedDict[str, Bench] = OrderedDict()
@@ -156,7 +156,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Print nothing."""
 
 
-def serve(source: Source, port: int = 0, ready: Callable[[str, Path], None] = print) -> None:
+def serve(source: BenchSource, port: int = 0, ready: Callable[[str, Path], None] = print) -> None:
     """Serve a record until it is interrupted.
 
     Args:

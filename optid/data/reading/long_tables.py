@@ -6,13 +6,13 @@ import numpy as np
 
 from optid.data.reading.clock import is_time_name
 from optid.data.reading.format import is_number
-from optid.data.reading.sources import Table
+from optid.data.reading.sources import RawTable
 from optid.errors import DataError
 
 MOST_TAGS = 1000
 
 
-def explained(error: DataError, table: Table, inputs: Any, outputs: Any) -> DataError:
+def explained(error: DataError, table: RawTable, inputs: Any, outputs: Any) -> DataError:
     """Return the error about a missing column, or the one that the table is long where its cells name the channels."""
     texts = [name for name in table.names if name and name not in table.dates and not is_time_name(name)]
     if not texts:

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 
 from optid.data.reading.clock import NoStamps, TimeColumn, over_midnight, recognise, seconds
-from optid.data.reading.sources import Source, Table
+from optid.data.reading.sources import RawTable, Source
 from optid.data.reading.uniform import COARSE, repeated
 from optid.errors import DataError
 
 AGREEMENT = 1e-3  # share of the span by which two clocks may differ, beyond one step of the coarser one
 
 
-def settle(block: Mapping[str, Any], names: Sequence[str], table: Table | Source, asked: bool
+def settle(block: Mapping[str, Any], names: Sequence[str], table: RawTable | Source, asked: bool
            ) -> tuple[TimeColumn, np.ndarray, list[str]]:
     """Return the clock that some columns hold, its stamps (N,), and findings.
 
@@ -56,7 +56,7 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table | Source
     return clock, stamps, [clock.finding] * bool(clock.finding) + said
 
 
-def _paired(found: list[tuple[TimeColumn, np.ndarray]], block: Mapping[str, Any], table: Table | Source
+def _paired(found: list[tuple[TimeColumn, np.ndarray]], block: Mapping[str, Any], table: RawTable | Source
             ) -> list[tuple[TimeColumn, np.ndarray]]:
     """Join a column of dates without a time of day, and one of times of day."""
     hours = [one for one in found if one[0].kind == "times of day" or (one[1].dtype.kind == "m" and (

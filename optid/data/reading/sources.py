@@ -25,7 +25,7 @@ PLANT = (".xlsx", ".tdms", ".mf4")
 
 
 @dataclass(frozen=True)
-class Table:
+class RawTable:
     """A source whose columns can be loaded by name."""
 
     label: str  # name of the source, for messages
@@ -43,7 +43,7 @@ class Table:
     findings: tuple[str, ...] = ()
     # function of the columns of inputs and outputs, and of `time` as of `optid.data.readers.read`, where they decide
     # which experiments there are, and with which clock: returns a table for each
-    split: Callable[[Sequence[str], Any], "list[Table]"] | None = None
+    split: Callable[[Sequence[str], Any], "list[RawTable]"] | None = None
     inputs: Mapping[str, str] | None = None  # {channel: column} of the inputs, where the source says it
     outputs: Mapping[str, str] | None = None
 
@@ -80,7 +80,7 @@ def existing(path: Path) -> Path:
 # -- whole
 
 
-def open_tables(source: Any, how: Format) -> list[Table]:
+def open_tables(source: Any, how: Format) -> list[RawTable]:
     """Open a file, a frame, a dictionary of arrays or an array: one table for each experiment that it holds.
 
     `DataError`: no such file, unknown format, an unreadable file, or a missing extra with its pip line.
@@ -104,25 +104,27 @@ def open_tables(source: Any, how: Format) -> list[Table]:
     return [_of_frame("the frame", source, how)]
 
 
-def _file_tables(path: Path, kind: str, how: Format) -> list[Table]:
+def _file_tables(path: Path, kind: str, how: Format) -> list[RawTable]:
     if kind in TEXT:
         file = open_csv(path, replace(how, delimiter="\t") if kind == ".tsv" and not how.delimiter else how)
-        return [Table(path.name, file.names, file.columns, file.layout.how, None, file.layout.dates, file.layout.units,
-                      advice=file.layout.advice, hints=file.layout.hints, findings=file.layout.findings)]
+        return [RawTable(path.name, file.names, file.columns, file.layout.how, None, file.layout.dates,
+                         file.layout.units, advice=file.layout.advice, hints=file.layout.hints,
+                         findings=file.layout.findings)]
     if kind == ".parquet":
         from optid.data.reading.parquet import load_parquet, parquet_head
 
         head = parquet_head(path)
-        return [Table(path.name, list(head.columns), partial(load_parquet, path), how, None, dated_columns(head))]
+        return [RawTable(path.name, list(head.columns), partial(load_parquet, path), how, None, dated_columns(head))]
     if kind == ".npz":
         names = list(npz_arrays(path))
         known = npz_arrays(path, [name for name in names if is_step_name(name) or is_rate_name(name)])
         step, rest = _stated_step(known, path.name)
         names = [name for name in names if name not in known or name in rest]
-        return [Table(path.name, names, lambda wanted, _: npz_arrays(path, wanted), how, step=step)]
+        return [RawTable(path.name, names, lambda wanted, _: npz_arrays(path, wanted), how, step=step)]
     if kind == ".npy":
         opened = open_npy(path, how.columns)
-        return [Table(path.name, list(opened.names), lambda wanted, _: next(opened.blocks(opened.rows, wanted)), how)]
+        return [RawTable(path.name, list(opened.names), lambda wanted, _: next(opened.blocks(opened.rows, wanted)),
+                         how)]
     if kind in PLANT:
         from optid.data.reading.plant_files import plant_tables
 
@@ -131,7 +133,7 @@ def _file_tables(path: Path, kind: str, how: Format) -> list[Table]:
     return [_of_mat(path, how)]
 
 
-def _of_mat(path: Path, how: Format) -> Table:
+def _of_mat(path: Path, how: Format) -> RawTable:
     from optid.data.reading.matlab import mat_contents, split_experiments
 
     contents = mat_contents(path)
@@ -140,25 +142,25 @@ def _of_mat(path: Path, how: Format) -> Table:
         reasons = " ".join(f"{name!r} {reason}" for name, reason in list(contents.refused.items())[:3])
         raise DataError(f"{path.name} holds no arrays of numbers. {reasons}".rstrip())
 
-    def split(signals: Sequence[str], time: Any) -> list[Table]:
-        return [Table(one.label, one.names, one.load, how, one.index, units=contents.units, step=one.step)
+    def split(signals: Sequence[str], time: Any) -> list[RawTable]:
+        return [RawTable(one.label, one.names, one.load, how, one.index, units=contents.units, step=one.step)
                 for one in split_experiments(path, contents, signals, time)]
 
-    return Table(path.name, names, lambda wanted, _: mat_contents(path, wanted).experiments[0], how, split=split,
-                 inputs=contents.inputs or None, outputs=contents.outputs or None)
+    return RawTable(path.name, names, lambda wanted, _: mat_contents(path, wanted).experiments[0], how, split=split,
+                    inputs=contents.inputs or None, outputs=contents.outputs or None)
 
 
-def _of_frame(label: str, frame: Any, how: Format) -> Table:
+def _of_frame(label: str, frame: Any, how: Format) -> RawTable:
     names, table = frame_names(label, frame)
     if len(table) == 0:
         raise DataError(f"{label} has no rows.")
     head = table.head(50)
     hints = clock_hints({str(name): head[name].to_list() for name in head.columns})
-    return Table(label, names, partial(load_frame, label, table), how, index_name(frame, names), dated_columns(table),
-                 hints=hints)
+    return RawTable(label, names, partial(load_frame, label, table), how, index_name(frame, names),
+                    dated_columns(table), hints=hints)
 
 
-def _of_data_set(label: str, source: Any, how: Format) -> Table:
+def _of_data_set(label: str, source: Any, how: Format) -> RawTable:
     """Return the table of an xarray data set: its variables of one dimension, with their units."""
     variables = {str(name): variable for name, variable in source.variables.items()}
     found = _of_arrays(label, {name: variable.values for name, variable in variables.items()}, how)
@@ -177,15 +179,15 @@ def _of_data_set(label: str, source: Any, how: Format) -> Table:
     return replace(found, load=load, units=units, index=index)
 
 
-def _of_arrays(label: str, variables: Mapping[Any, Any], how: Format) -> Table:
+def _of_arrays(label: str, variables: Mapping[Any, Any], how: Format) -> RawTable:
     if not variables:
         raise DataError(f"{label} holds no arrays.")
     named = {str(name): value for name, value in variables.items()}
     step, named = _stated_step(named, label)
     dated = tuple(name for name, value in named.items() if getattr(getattr(value, "dtype", None), "kind", "") in "Mm"
                   and getattr(value, "ndim", 0) == 1)
-    return Table(label, list(named), lambda wanted, _: {name: named[name] for name in wanted}, how, dates=dated,
-                 step=step)
+    return RawTable(label, list(named), lambda wanted, _: {name: named[name] for name in wanted}, how, dates=dated,
+                    step=step)
 
 
 def _stated_step(named: Mapping[str, Any], label: str) -> tuple[float | None, dict[str, Any]]:
@@ -204,13 +206,13 @@ def _stated_step(named: Mapping[str, Any], label: str) -> tuple[float | None, di
     return step, others
 
 
-def _of_array(label: str, array: np.ndarray, how: Format) -> Table:
+def _of_array(label: str, array: np.ndarray, how: Format) -> RawTable:
     if array.ndim not in (1, 2):
         raise DataError(f"{label} has shape {array.shape}; it must be (samples, channels).")
     table = array[:, None] if array.ndim == 1 else array
     check_shape(table, label)
     names = position_names(how.columns, table.shape[1], label)
-    return Table(label, names, _of_arrays(label, dict(zip(names, table.T)), how).load, how)
+    return RawTable(label, names, _of_arrays(label, dict(zip(names, table.T)), how).load, how)
 
 
 # -- in blocks and parts

@@ -10,6 +10,7 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,8 @@ from optid.solving.claims import NOT_FINITE
 from optid.solving.solve import solve
 from optid.solving.steps import choose_solvers
 from optid.studies.execution.machine import Peak, machine
-from optid.studies.execution.worker import keep
 from optid.studies.grid import Cell, content_hash, determining
-from optid.studies.sources.records import Record, load
+from optid.studies.records import Record, load
 from optid.studies.storage.rows import (
     DONE,
     ERROR,
@@ -40,6 +40,9 @@ from optid.studies.storage.rows import (
 KEPT = 3  # records that a worker keeps, so that cells of one data set load it once
 SHORTEST = 0.01  # smallest time limit of a solver in seconds: some take 0 as no limit
 REHEARSED = 0.25  # share of the time limit up to which the first cell of its kind in a process is run twice
+
+kept_row: Path | None = None
+"""File for a row that is valid if the rest of the current cell fails, in a process of its own."""
 
 _records: OrderedDict[tuple[Any, ...], Record] = OrderedDict()
 _rehearsed: set[tuple[str, str, bool]] = set()
@@ -98,6 +101,12 @@ def _too_much(peak: Peak, cell: Cell) -> str:
     return f"held {held:.0f} MB; the limit is {most:g} MB" if held > most else ""
 
 
+def keep(row: Mapping[str, Any]) -> None:
+    """Keep the row of the current cell, valid if the rest of the cell fails; does nothing in the caller's process."""
+    if kept_row is not None:
+        kept_row.write_text(json.dumps(dict(row)))
+
+
 def prepare() -> None:
     """Import what every fit needs and load compiled kernels, so that no cell includes that time."""
     from optid.examples import dead_zone
@@ -124,11 +133,16 @@ def without_warm(row: Mapping[str, Any], reason: str) -> dict[str, Any]:
     return {**row, **dict.fromkeys(("warm_s", "warm_status", "warm_iterations")), "reason": words}
 
 
+def versions_of(cell: Cell) -> dict[str, str]:
+    """Return the versions here of what determines the result of a cell."""
+    return determining(cell.formulation_name, cell.solver_name, cell.data_source.system is not None)
+
+
 def known(cell: Cell) -> dict[str, Any]:
     """Return the columns of a cell that are known before it runs."""
     entry = cell.data_source
     found = {name: getattr(cell, name) for name in NAMES if hasattr(cell, name)}
-    found["versions"] = determining(cell.formulation_name, cell.solver_name, entry.system is not None)
+    found["versions"] = versions_of(cell)
     found |= {name: as_json(found[name]) for name in ("options", "constraints", "solver_options", "versions")}
     return found | {"system": entry.system, "file": ", ".join(map(str, entry.files)) or None, "machine": machine(),
                     "data_hash": cell.data_hash or None, "n_estimation": cell.samples}
@@ -189,6 +203,7 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
         "reason": solution.reason, "reached": str(solution.status) in SUCCESS, "proved": solution.proof,
         "false_claim": any(step.false_claim for step in steps), "solver_used": solution.solver,
         "program_class": program.kind, "unknowns": program.size, "n_programs": len(steps),
+        "steps": as_json(_steps(fitted)),
         "objective": solution.objective, "scale": solution.scale, "bound": bound.value if bound else None,
         "gap": solution.gap, "iterations": sum(counts) if min(counts, default=-1) >= 0 else None,
         "build_s": solution.times.build, "compile_s": sum(compiled) if compiled else None,
@@ -198,6 +213,17 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
     if residuals is not None:
         row |= {name: getattr(residuals, name) for name in ("violation", "stationarity", "complementarity")}
     return row
+
+
+def _steps(fitted: Fit) -> list[dict[str, Any]]:
+    """Return one entry per step and solver of a fit."""
+    groups: dict[tuple[str, str], list[Solution]] = {}
+    for name, solution in fitted.steps:
+        groups.setdefault((name, solution.solver), []).append(solution)
+    return [{"step": step, "solver": solver, "programs": len(found),
+             "reached": sum(str(one.status) in SUCCESS for one in found),
+             "iterations": sum(one.iterations for one in found) if all(one.iterations >= 0 for one in found) else None,
+             "seconds": sum(one.times.solve for one in found)} for (step, solver), found in groups.items()]
 
 
 def _warm(cell: Cell, fitted: Fit, row: dict[str, Any], limit: float, given: float) -> dict[str, Any]:

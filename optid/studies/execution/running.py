@@ -3,54 +3,62 @@
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from optid.data.reduction import available_cores
 from optid.errors import DatabaseError, StudyError, nearest
-from optid.studies.definition.description import Study
+from optid.studies.definition import Definition, as_toml
 from optid.studies.execution.cell import known, lost_row
+from optid.studies.execution.executors import run_here, run_with
 from optid.studies.grid import Cell, cells, check_unchanged, located
-from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, REFUSED
+from optid.studies.storage.rows import COLUMNS, KILLED, NAMES, OUTCOMES, REFUSED
 from optid.studies.storage.store import LABELS, Store
+from optid.studies.trial import check_data
 
 Row = dict[str, Any]
-Executor = Callable[[Sequence[Cell]], Iterator[Row]]
+Execution = Callable[[Sequence[Cell]], Iterator[Row]]
 """Yields one row for each cell, in any order; closing the generator ends all that it started."""
 Progress = Callable[[int, int, Row | None], None]
 
 
-def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: Any = None,
+def run(study: Definition, db: str | Path, *, workers: int | None = None, executor: Executor | None = None,
         progress: Progress | None = None, accept_changed_data: bool = False, retry: str | Sequence[str] = (),
-        execute: Executor | None = None) -> list[Row]:
+        execute: Execution | None = None) -> list[Row]:
     """Run the cells of a study that have no row yet.
 
     Args:
         study: what to run.
         db: the database; made when it is not there.
         workers: processes on this machine; one per core when not given.
-        scheduler: Dask scheduler whose workers run the cells instead, as for `optid.data.clusters.connected`: an
-            address, a scheduler file or a Client.
+        executor: of `concurrent.futures`, or one like it such as Dask's ``Client(...).get_executor()``, whose workers
+            run the cells instead; they must see data files under the same path, and have the same versions.
         progress: called with (cells that have a row, all cells, None) before work starts and with the row after each.
         accept_changed_data: run cells again whose data file is not what it was; their former rows are set aside.
         retry: outcomes whose rows are set aside and run again, such as "crashed" or "time limit"; rows of other
             studies with such an outcome are not taken over.
-        execute: another way to run cells, in place of ``workers`` and ``scheduler``.
+        execute: another way to run cells, in place of ``workers`` and ``executor``.
 
     Returns:
         The rows of all cells of the study, in the order of its grid.
 
     Raises:
-        StudyError: a data file changed since the last run, or an unknown outcome to retry.
+        StudyError: a data file changed since the last run, an unknown outcome to retry, or an executor that broke
+            (what is finished is kept then).
         DatabaseError: another run is writing to the database, it is of another schema version, or it cannot be written
             (what is finished is kept then, and the next run goes on from there).
-        ClusterError: the cluster cannot be used.
     """
     retry = _checked(retry)
+    check_data(study)
     grid = cells(study)
-    execute = execute or _executor(grid, workers, scheduler)
+    if workers is not None and executor is not None:
+        raise StudyError("workers are processes of this machine, an executor has its own: leave one of them out")
+    execute = execute or (partial(run_here, workers=available_cores(workers, "workers", StudyError))
+                          if executor is None else partial(run_with, executor))
     with Store(db, write=True) as store, store.claim(study.name):
         todo = _prepared(store, study, grid, accept_changed_data, retry)
         store.describe(study.name, _description(study))
@@ -58,7 +66,7 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
         return store.rows_of(study.name, [cell.identity for cell in grid])
 
 
-def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, retry: str | Sequence[str] = ()
+def plan(study: Definition, db: str | Path, *, accept_changed_data: bool = False, retry: str | Sequence[str] = ()
          ) -> tuple[list[Cell], list[Cell], str]:
     """Return what a run would do, without changing the database, which need not exist.
 
@@ -67,7 +75,9 @@ def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, ret
     Returns:
         All cells, those that a run would run, and a text on the rows that it would set aside.
     """
-    retry, grid = _checked(retry), cells(study)
+    retry = _checked(retry)
+    check_data(study)
+    grid = cells(study)
     if not Path(db).exists():
         return grid, grid, ""
     with Store(db) as store, store.copy() as copy:
@@ -75,7 +85,7 @@ def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, ret
         return grid, todo, describe_previous_run(copy, study)
 
 
-def describe_previous_run(store: Store, study: Study) -> str:
+def describe_previous_run(store: Store, study: Definition) -> str:
     """Return a text on the superseded rows of a study and the reasons; empty if there are none."""
     axes = {"data": study.data, "formulation": study.formulations, "solver": study.solvers}
     known_labels = [{entry.name for entry in entries} for entries in axes.values()]
@@ -99,20 +109,19 @@ def _checked(retry: str | Sequence[str]) -> Sequence[str]:
     return retry
 
 
-def _prepared(store: Store, study: Study, grid: list[Cell], accept_changed_data: bool, retry: Sequence[str]
+def _prepared(store: Store, study: Definition, grid: list[Cell], accept_changed_data: bool, retry: Sequence[str]
               ) -> list[Cell]:
     """Make the rows of a database those of the grid, and return the cells without a row."""
     if not accept_changed_data:
         check_unchanged(grid, store.data_hashes())
     store.keep(study.name, [cell.identity for cell in grid])
-    if retry:
-        store.set_aside(study.name, retry)
+    store.set_aside(study.name, [KILLED, *retry])
     store.append(_relabelled(store, grid, retry))
     done = store.finished(study.name)
     return [cell for cell in grid if cell.identity not in done]
 
 
-def run_to_frame(study: Study, db: str | Path | None = None, **settings: Any) -> Any:
+def run_to_frame(study: Definition, db: str | Path | None = None, **settings: Any) -> Any:
     """Run a study, by default in a temporary database; return a pandas frame, or dicts where pandas is missing."""
     with tempfile.TemporaryDirectory() as folder:
         rows = run(study, db or Path(folder) / "study.sqlite", **settings)
@@ -128,22 +137,7 @@ def run_to_frame(study: Study, db: str | Path | None = None, **settings: Any) ->
     return frame
 
 
-def _executor(grid: Sequence[Cell], workers: int | None, scheduler: Any) -> Executor:
-    if workers is not None and scheduler is not None:
-        raise StudyError("workers are processes of this machine, a cluster has its own: leave workers or scheduler out")
-    if scheduler is not None:
-        from optid.studies.execution import cluster
-
-        with cluster.connected(scheduler, cluster.packages(grid)):  # refused before the database is made
-            pass
-        return lambda todo: cluster.execute(todo, scheduler=scheduler)
-    from optid.studies.execution import workers as processes
-
-    available_cores(workers, "workers", StudyError)
-    return lambda todo: processes.execute(todo, workers=workers)
-
-
-def _work(todo: list[Cell], total: int, execute: Executor, store: Store, progress: Progress | None) -> None:
+def _work(todo: list[Cell], total: int, execute: Execution, store: Store, progress: Progress | None) -> None:
     done = total - len(todo)
     if progress is not None:
         progress(done, total, None)
@@ -166,15 +160,15 @@ def _work(todo: list[Cell], total: int, execute: Executor, store: Store, progres
         raise StudyError(f"{len(expected)} cells of {total} returned no row; run the study again")
 
 
-def _all_rows(todo: Sequence[Cell], execute: Executor) -> Generator[Row, None, None]:
+def _all_rows(todo: Sequence[Cell], execute: Execution) -> Generator[Row, None, None]:
     """Yield the rows of refused cells, then those of the others."""
     yield from (lost_row(cell, REFUSED, cell.refusal) for cell in todo if cell.refusal)
     yield from execute([cell for cell in todo if not cell.refusal])
 
 
-def _description(study: Study) -> str:
+def _description(study: Definition) -> str:
     try:
-        return replace(study, data=[located(entry, study.folder) for entry in study.data]).to_toml()
+        return as_toml(replace(study, data=tuple(located(entry, study.folder) for entry in study.data)))
     except StudyError:  # records in memory, and other values that TOML does not hold, have no text
         return ""
 
@@ -190,4 +184,4 @@ def _relabelled(store: Store, grid: Iterable[Cell], retry: Sequence[str]) -> lis
             if there.get((cell.study, *cell.identity)) != tuple(labels.values()):
                 wanted[cell.identity] = labels
     return [row | wanted[row["key"], row["repetition"]] for row in store.rows_of(None, wanted)
-            if row["outcome"] not in retry]
+            if row["outcome"] not in (KILLED, *retry)]

@@ -13,16 +13,17 @@ import numpy as np
 from optid.errors import DataError
 from optid.program.solution import Status
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 DONE, TIME_LIMIT, MEMORY_LIMIT, CRASHED = "done", "time limit", "memory limit", "crashed"
-ERROR, REFUSED, NON_FINITE = "error", "refused", "non-finite"
+KILLED, ERROR, REFUSED, NON_FINITE = "killed", "error", "refused", "non-finite"
 
 OUTCOMES = {
     DONE: "the fit was completed and judged; the result is in `status_verified`",
     TIME_LIMIT: "the worker was killed because the cell took longer than its time limit",
     MEMORY_LIMIT: "the worker exceeded its memory limit, or the machine had no more memory",
-    CRASHED: "the worker died: segmentation fault, abort, or killed from outside",
+    CRASHED: "the worker died: segmentation fault, abort, or an exit of its own",
+    KILLED: "the worker was killed from outside; the next run of the study runs the cell again",
     ERROR: "the cell could not be run: unreadable record, wrong argument, an exception outside the solver",
     REFUSED: "the solver cannot take this formulation, or is not installed; nothing was run",
     NON_FINITE: "the fit was completed, but the point, the objective or the model has numbers that are not finite",
@@ -93,7 +94,9 @@ COLUMNS: tuple[Column, ...] = (
     Column("solver_used", "text", "back end that ran, where auto chose it"),
     Column("program_class", "text", "class of the last programme: LP, QP, SOCP, SDP, conic or NLP"),
     Column("unknowns", "integer", "scalar variables of the last programme"),
-    Column("n_programs", "integer", "programmes solved: 1, or the steps of a procedure"),
+    Column("n_programs", "integer", "programmes solved: 1, or those of all steps of a procedure"),
+    Column("steps", "json", "one entry per step and solver: step, solver, programs, reached, iterations, seconds; the "
+                            "view `steps` has a row for each"),
     # the answer
     Column("objective", "number", "objective at the point, recomputed", "data"),
     Column("scale", "number", "objective of the zero model, the yardstick of objectives", "data"),

@@ -26,6 +26,10 @@ STALE = 600.0  # seconds without a new row after which a run on another machine 
 Row = dict[str, Any]
 
 _LIST = ", ".join(f'"{name}"' for name in NAMES)
+_STEPS = ", ".join(["study", "rows.key", "repetition", "data", "formulation", "rows.solver", *(
+    f"json_extract(step.value, '$.{name}') AS {alias}" for name, alias in (
+        ("step", "step"), ("solver", "solver_used"), ("programs", "programs"), ("reached", "reached"),
+        ("iterations", "iterations"), ("seconds", "seconds")))])
 _SAME = "study = ? AND key = ? AND repetition = ?"
 _OF_STUDY = "(:study IS NULL OR study = :study)"
 
@@ -90,6 +94,7 @@ class Store:
                 connection.execute("PRAGMA journal_mode = WAL")
                 for table, its_columns in tables.items():
                     connection.execute(f"CREATE TABLE {table} ({its_columns}) STRICT")
+                connection.execute(f"CREATE VIEW steps AS SELECT {_STEPS} FROM rows, json_each(rows.steps) AS step")
                 connection.executemany("INSERT INTO meta VALUES (?, ?)", [
                     ("schema version", str(SCHEMA_VERSION)), ("made by", f"optid {__version__}")])
             with self._named("written"), suppress(FileExistsError):  # another process was first

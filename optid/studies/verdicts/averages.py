@@ -1,4 +1,4 @@
-"""Averages of times, comparisons of two on the problems that both solved, performance profiles and growth with length.
+"""Averages of times, comparisons of two on the problems that both solved, and performance profiles.
 
 E. D. Dolan, J. J. Moré: Benchmarking optimization software with performance profiles. Mathematical Programming 91
 (2002) 201-213. With more than two solvers a profile compares each with the fastest, not with each other (N. Gould,
@@ -8,14 +8,14 @@ J. Scott, ACM Transactions on Mathematical Software 43 (2016) 15).
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import binomtest
 from scipy.stats import t as student
 
 SHIFT = 0.01  # s; times far below it count alike, so that a microsecond saved does not outweigh a second
 MINIMUM_PAIRS = 6  # with five, even a unanimous comparison has a two-sided sign-test probability of 1/16 > 0.05
 MINOR = 0.1  # 10 % of a time or an error, 0.1 points of fit: without practical meaning
 VAGUE = 10.0  # with `MINOR` of 10 %, the interval of a tie is within a factor of 2
-MINIMUM_LENGTHS = 3  # two lengths give a slope but no standard error
-MINIMUM_SPREAD = 4.0  # between the longest and the shortest record
+LEVEL = 0.05  # of tests
 
 
 def shifted_geometric_mean(times: np.ndarray, shift: float = SHIFT) -> float:
@@ -97,6 +97,11 @@ def means_of_groups(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
     return np.array([np.mean(values[groups == label], axis=0) for label in dict.fromkeys(groups)])
 
 
+def sign_test(lost: int, won: int) -> float:
+    """Return the exact one-sided probability of at least as many losses between two equals; 1 without any."""
+    return float(binomtest(lost, lost + won, alternative="greater").pvalue) if lost + won else 1.0
+
+
 @dataclass(frozen=True)
 class PerformanceProfile:
     """The share of problems solved within a factor of the fastest time: a right-continuous step function."""
@@ -124,48 +129,3 @@ def performance_profiles(times: np.ndarray) -> list[PerformanceProfile]:
         factors, counts = np.unique(ratios[np.isfinite(ratios)], return_counts=True)
         profiles.append(PerformanceProfile(factors, np.cumsum(counts) / max(len(ratios), 1)))
     return profiles
-
-
-@dataclass(frozen=True)
-class Growth:
-    """A power law: time proportional to the record length to the power of the slope."""
-
-    slope: float  # nan where it cannot be estimated
-    low: float  # its 95 % interval
-    high: float
-    lengths: np.ndarray  # ascending, of data with two or more
-    times: np.ndarray  # geometric mean time at each of them
-    missing: str = ""  # the missing data
-
-
-def time_growth(times: np.ndarray, n: np.ndarray, groups: np.ndarray) -> Growth:
-    """Fit ``log t = c_group + slope log N`` by least squares.
-
-    Seeds of one group and length are averaged first: the interval is about the power law, not about the mean time. At
-    least one group must have `MINIMUM_LENGTHS` lengths with a ratio of `MINIMUM_SPREAD` between them.
-
-    Args:
-        times: (P,) seconds, ``nan`` where not solved.
-        n: (P,) record lengths.
-        groups: (P,) numbers of formulation, data set and noise. Only groups with two lengths count.
-    """
-    usable = np.isfinite(times) & np.isfinite(n) & (n > 0) & (times > 0)
-    logs = np.log(times[usable])
-    pairs, place = np.unique(np.column_stack([groups[usable], n[usable]]), axis=0, return_inverse=True)
-    group, place = pairs[:, 0], place.ravel()
-    spans = {g: pairs[group == g, 1] for g in np.unique(group)}
-    several = np.isin(group, [g for g, span in spans.items() if len(span) > 1])
-    lengths = np.unique(pairs[several, 1])
-    shown = np.array([np.exp(np.mean(logs[(several & (pairs[:, 1] == at))[place]])) for at in lengths])
-    if not any(len(span) >= MINIMUM_LENGTHS and span[-1] >= MINIMUM_SPREAD * span[0] for span in spans.values()):
-        most = max(map(len, spans.values()), default=0)
-        needs = (f"needs at least {MINIMUM_LENGTHS} record lengths, the longest {MINIMUM_SPREAD:g} times the shortest, "
-                 f"solved on the same data; there {'is' if most == 1 else 'are'} at most {most}")
-        return Growth(float("nan"), float("nan"), float("nan"), lengths, shown, needs)
-    points = np.column_stack([np.log(pairs[:, 1]), np.bincount(place, logs) / np.bincount(place)])[several]
-    kinds, number = np.unique(group[several], return_inverse=True)
-    x, t = (points - means_of_groups(points, number)[number]).T  # the groups stand in order
-    value = float(x @ t / (x @ x))
-    rest, freedom = t - value * x, len(t) - len(kinds) - 1  # one at least: a group has three lengths
-    half = float(student.ppf(0.975, freedom) * np.sqrt(rest @ rest / freedom / (x @ x)))
-    return Growth(value, value - half, value + half, lengths, shown)

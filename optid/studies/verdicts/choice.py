@@ -5,8 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
-from optid.studies.verdicts.averages import MINIMUM_PAIRS, Paired, paired
-from optid.studies.verdicts.ranks import LEVEL, sign_test
+from optid.studies.verdicts.averages import LEVEL, MINIMUM_PAIRS, Paired, paired, sign_test
 from optid.studies.verdicts.statement import listed, there_are
 
 FIRST, TIE, CANNOT_TELL, ONLY_ONE, NOBODY = "first", "tie", "cannot tell", "only one", "nobody"
@@ -39,13 +38,6 @@ class Choice:
     def decided(self) -> bool:
         """Whether one is ahead or several are equal."""
         return self.kind in (FIRST, TIE)
-
-    @property
-    def shortfall(self) -> str:
-        """A sentence on the missing data; empty where the choice is decided."""
-        if self.kind == ONLY_ONE:
-            return "There is nothing to compare it with."
-        return "" if self.decided else f"The comparison {self.missing}."
 
 
 def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack: float = RELIABLE,
@@ -80,7 +72,7 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
     best = known[:, [int(np.argmax(counts))]]
     lost, won = (best & ~known).sum(axis=0), (known & ~best).sum(axis=0)
     reliable = [int(s) for s in np.flatnonzero(counts)
-                if lost[s] - won[s] <= allowed or sign_test(int(lost[s]), int(won[s]), "greater") >= LEVEL]
+                if lost[s] - won[s] <= allowed or sign_test(int(lost[s]), int(won[s])) >= LEVEL]
     candidates = tuple(names[s] for s in reliable)
     beaten = set()
     for one, other in combinations(reliable, 2):
@@ -90,7 +82,7 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
     leaders = [s for s in unbeaten if counts[s] >= max(counts[unbeaten]) - allowed]
     common = known[:, leaders].all(axis=1)
     if not leaders or not common.any():
-        circle = f"has no order: of {listed(candidates)}, each is beaten by another one on the {noun}s that both solve"
+        circle = f"has no order: pairwise comparisons are cyclic, each of {listed(candidates)} is beaten by another one"
         missing = f"needs a {noun} that {listed([names[s] for s in leaders])} all solve" if leaders else circle
         return Choice(CANNOT_TELL, "", (), candidates, {}, solved, missing)
     lead = min(leaders, key=lambda s: compare(np.where(common, costs[:, s], np.nan), np.ones(len(costs))).value)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from optid.errors import DataError
-from optid.show.wording import seconds
+from optid.phrases import seconds
 from optid.studies.storage.rows import ERROR, REFUSED, columns
 from optid.studies.verdicts.averages import MINOR
 from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, tabulate
@@ -59,11 +59,11 @@ class SolverComparison:
         solved = [line for line in self.lines if line.state == SOLVED]
         at = f"the accuracy of {self.accuracy:.0e}"
         if not solved and not self.lines:
-            return Statement(FAIR, "No solver takes this formulation", "choose others (optid solvers).", "solver")
+            return Statement(FAIR, "No solver takes this formulation", "choose others (optid solvers).")
         if not solved:
             states = grouped((line.state, line.solver) for line in self.lines)
             why = "; ".join(f"{state}: {listed(names)}" for state, names in states.items())
-            return Statement(BAD, f"No solver reached {at}", f"{counting(self.accuracy)}; {why}.", "solver")
+            return Statement(BAD, f"No solver reached {at}", f"{counting(self.accuracy)}; {why}.")
         first, *others = solved
         close = [line for line in others if line.cold <= (1 + MINOR) * first.cold and line.proved == first.proved]
         rest = [line for line in others if line not in close]
@@ -78,7 +78,7 @@ class SolverComparison:
             failed = [line.solver for line in self.lines if line is not first]
             text += f"; {listed(failed)} did not" if failed else "; there is no other to compare it with"
         either = " or ".join(names) if len(names) < 4 else f"any of {listed(names)}"
-        return Statement(GOOD, f"Use {either}", f"{text}.", "solver")
+        return Statement(GOOD, f"Use {either}", f"{text}.")
 
     @property
     def recommendation(self) -> str:
@@ -115,12 +115,11 @@ def compare(rows: Sequence[dict[str, Any]]) -> SolverComparison:
 
 def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> StudyVerdict:
     """Return the verdict on the rows of `compare`, with the headline of the comparison; it raises the same."""
-    head, verdict = compare(rows).headline, conclude(rows)
-    caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. A study of at least 6 problems "
-                       "(optid study run) shows which solver to prefer on others.", "data sets")
-    said = [statement for statement in verdict.statements if statement.about != "data sets"]
+    head = compare(rows).headline
+    caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. A study of at least 6 problems (optid "
+                       "study run) shows which solver to prefer on others.")
     head = replace(head, text=head.text[:1].upper() + head.text[1:])  # its own sentence on the page
-    return replace(verdict, headline=head, statements=(caveat, *said))
+    return replace(conclude(rows), headline=head, statements=(caveat,))
 
 
 def _order(line: Line) -> tuple[Any, ...]:

@@ -9,7 +9,17 @@ from scipy.stats import mode
 
 from optid.errors import DataError
 from optid.program.solution import GRADIENT, Status, tolerance
-from optid.studies.storage.rows import CRASHED, DONE, ERROR, MEMORY_LIMIT, NON_FINITE, REFUSED, SUCCESS, TIME_LIMIT
+from optid.studies.storage.rows import (
+    CRASHED,
+    DONE,
+    ERROR,
+    KILLED,
+    MEMORY_LIMIT,
+    NON_FINITE,
+    REFUSED,
+    SUCCESS,
+    TIME_LIMIT,
+)
 
 SOLVED, NOT_RUN = "solved", "not run"
 FALSE_CLAIM, CONTRADICTED, INFEASIBLE = "false claim", "contradicted", str(Status.INFEASIBLE)
@@ -18,7 +28,7 @@ WARM_FAILED, UNTIMED = "warm solve failed", "no time"
 VALUE = 1e-6  # relative difference of objectives up to which two runs found the same minimum
 TIMES = {"solve": ("compile_s", "solve_s"), "fit": ("fit_s",), "warm": ("warm_s",)}  # measures: sums of columns
 VERIFIED = (SOLVED, WARM_FAILED, UNTIMED)  # the accuracy was reached, with or without a time
-UNANSWERED = (TIME_LIMIT, MEMORY_LIMIT, CRASHED, ERROR, str(Status.LIMIT))  # ended before the solver had an answer
+UNANSWERED = (TIME_LIMIT, MEMORY_LIMIT, CRASHED, KILLED, ERROR, str(Status.LIMIT))  # no answer of the solver
 MEANINGS = {
     SOLVED: "the verified accuracy was reached, at the best objective that any solver verified",
     FALSE_CLAIM: "the solver claimed success or infeasibility, which the verified residuals contradict",
@@ -53,8 +63,6 @@ class Results:
     data: np.ndarray
     formulation: np.ndarray
     case: np.ndarray  # number of the record, (P,): the same for all formulations of one record
-    group: np.ndarray  # number of formulation, data set and noise, (P,): what makes a problem slow but its length
-    n: np.ndarray  # samples that the fits see, those held out left out, (P,); nan where no run got that far
     solvers: tuple[str, ...]  # labels, in alphabetical order
     state: np.ndarray  # `SOLVED` or the reason, (P, S)
     reason: np.ndarray  # sentence of the first run that did not solve it, (P, S)
@@ -65,7 +73,6 @@ class Results:
     objective: np.ndarray  # (P, S), where the verified accuracy was reached, local minima included; nan otherwise
     size: np.ndarray  # yardstick of differences of objectives, (P,)
     residual: np.ndarray  # worst verified residual as `worst_residual` counts it, (P, S), wherever there is a point
-    limit: np.ndarray  # time limit in seconds, (P,)
     row: np.ndarray  # number of the row that represents the entry, (P, S); -1 without one
     accuracy: float  # requested relative accuracy that is compared at
     measure: str  # of time: "solve", "fit" or "warm"
@@ -155,11 +162,9 @@ def tabulate(table: Table, accuracy: float | None = None, time: str = "solve") -
     of_problem = {name: values[first] for name, values in table.items()}
     return _against_the_best(Results(
         *(of_problem[name] for name in ("study", "data", "formulation")),
-        case=_numbered(of_problem, *_RECORD), group=_numbered(of_problem, "formulation", "study", "data", "noise"),
-        n=np.array([_largest(*(table[c][m] for c in ("n_estimation", "n_samples", "samples"))) for m in members]),
-        size=np.array([_largest(table["scale"][m]) for m in members]),
-        limit=np.array([_largest(table["time_limit"][m]) for m in members]), solvers=solvers, state=state,
-        reason=reason, false=false, row=row, proved=proved, accuracy=accuracy, measure=time, **numbers))
+        case=_numbered(of_problem, *_RECORD), size=np.array([_largest(table["scale"][m]) for m in members]),
+        solvers=solvers, state=state, reason=reason, false=false, row=row, proved=proved, accuracy=accuracy,
+        measure=time, **numbers))
 
 
 def _places(table: Table) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
@@ -191,8 +196,8 @@ def _other_accuracy(table: Table, accuracy: float) -> np.ndarray:
     return distance > nearest[entry]
 
 
-def _largest(*choices: np.ndarray) -> float:
-    return next((float(np.max(c[np.isfinite(c)])) for c in choices if np.isfinite(c).any()), float("nan"))
+def _largest(values: np.ndarray) -> float:
+    return float(np.max(values[np.isfinite(values)], initial=-np.inf)) if np.isfinite(values).any() else float("nan")
 
 
 def worst_residual(table: Table) -> np.ndarray:

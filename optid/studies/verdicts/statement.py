@@ -10,7 +10,6 @@ from optid.program.solution import tolerance
 Key = TypeVar("Key")
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
-NO_DIFFERENCE = "No difference beyond chance or"
 FINEST = tolerance(0.0) / 100  # requested accuracies below are judged as this one
 
 
@@ -21,7 +20,6 @@ class Statement:
     tone: str  # "good", "fair" or "bad"
     word: str  # the heading: what to do
     text: str  # why, with the numbers
-    about: str  # "solver", "formulation", "data sets", "claims"
 
 
 def grouped(pairs: Iterable[tuple[Key, str]]) -> dict[Key, list[str]]:

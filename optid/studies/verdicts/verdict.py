@@ -9,10 +9,11 @@ import numpy as np
 
 from optid.errors import DataError
 from optid.phrases import plural
+from optid.registry import render
 from optid.studies.storage.rows import ERROR, REFUSED, columns
-from optid.studies.verdicts.advice import carries_over, choice_of_solver, headline, no_solution
-from optid.studies.verdicts.agreement import Agreement, agreement_matrix
-from optid.studies.verdicts.model_advice import UNDECIDED, choice_of_formulation
+from optid.studies.storage.store import rows_of_one
+from optid.studies.verdicts.headline import headline, model_statement
+from optid.studies.verdicts.models import Quality, compare_formulations
 from optid.studies.verdicts.outcomes import (
     CONTRADICTED,
     NOT_RUN,
@@ -25,9 +26,9 @@ from optid.studies.verdicts.outcomes import (
     states_of_rows,
     tabulate,
 )
-from optid.studies.verdicts.quality import Quality, compare_formulations
 from optid.studies.verdicts.standings import StandingsSection, compare_solvers
 from optid.studies.verdicts.statement import BAD, FAIR, Statement, grouped, listed
+from optid.studies.verdicts.steps import StepStanding, compare_steps
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,12 @@ class StudyVerdict:
     found: Results  # problems and solvers, the accuracy and the measure of time
     overall: StandingsSection  # comparison on all problems
     sections: tuple[StandingsSection, ...]  # comparison on the problems of each formulation, in alphabetical order
-    quality: Quality  # the formulations by their models
-    agreement: Agreement  # of the solvers
+    models: Quality  # the formulations by their models
+    steps: tuple[StepStanding, ...]  # the solvers on the steps of procedures
     false_claims: tuple[FalseClaim, ...]  # most frequent first
     failures: tuple[Failure, ...]  # most frequent first, refusals at the end
     headline: Statement  # the verdict in one line
-    statements: tuple[Statement, ...]  # further recommendations, warnings and open questions
+    statements: tuple[Statement, ...]  # the other comparison, warnings and open questions
 
     @property
     def recommended(self) -> tuple[str, ...]:
@@ -72,8 +73,24 @@ class StudyVerdict:
         return self.overall.recommended
 
     def __str__(self) -> str:
-        """The verdict as text."""
-        return "\n".join(f"{s.word}: {s.text}" for s in (self.headline, *self.statements))
+        """The verdict as text, with its tables."""
+        return render(self)
+
+    def report(self, path: str | Path, *, title: str = "", command: str = "") -> Path:
+        """Write the verdict with its tables and figures as one HTML file that opens offline.
+
+        Args:
+            path: the file, replaced when it exists.
+            title: by default that of the study.
+            command: the command line behind the verdict, for the section that says how to reproduce it.
+
+        Returns:
+            The path.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        return render(self, "page", path, title=title, command=command)
 
 
 def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = None, time: str = "solve"
@@ -96,45 +113,30 @@ def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = No
     """
     if accuracy is not None and not 0 < accuracy < 1:
         raise DataError(f"accuracy is a number between 0 and 1; {accuracy:g} is not")
-    if isinstance(rows, str | Path):
-        from optid.studies.storage.store import rows_of_one
-
-        rows = rows_of_one(rows, study)
-    table = columns(rows)
+    table = columns(rows_of_one(rows, study) if isinstance(rows, str | Path) else rows)
     found = tabulate(table, accuracy, time)
     overall = compare_solvers(found)
     sections = tuple(compare_solvers(found.where(found.formulation == f), f) for f in sorted(set(found.formulation)))
-    quality = compare_formulations(found, table)
-    head = headline(overall, sections, quality)
-    return StudyVerdict(table, found, overall, sections, quality, agreement_matrix(found, table),
-                   _false_claims(table, found), _failures(found), head,
-                   tuple(_statements(overall, sections, quality, found, table, head)))
+    models = compare_formulations(found, table)
+    head = headline(overall, sections, models)
+    about_models = model_statement(models)
+    said = [] if about_models in (None, head) else [about_models]
+    return StudyVerdict(table, found, overall, sections, models, compare_steps(table), _false_claims(table, found),
+                        _failures(found), head, (*said, *_warnings(overall, found, table)))
 
 
-def _statements(overall: StandingsSection, sections: tuple[StandingsSection, ...], quality: Quality, found: Results,
-                table: Table, head: Statement) -> list[Statement]:
-    if not len(found.data):
-        return []
-    models, solvers = choice_of_formulation(quality), choice_of_solver(overall)
-    if head == models:
-        decided = not head.word.startswith(UNDECIDED)
-        said = [solvers, carries_over(quality.ranking, "formulation") if decided else None]
-    else:
-        said = [models]
-        if found.solved.any() and len(overall.standings) > 1 and (len(sections) == 1 or head == solvers):
-            said.append(carries_over(overall.ranking))
-    said += [_failed_data(found), _never(overall), _refuted(found, table)]
-    if not quality.truth and any(quality.solved.values()):
-        said.append(Statement(FAIR, "Truth unknown", "Errors of parameters and nonlinearity are unknown: no record has "
-                              "a known truth.", "formulation"))
+def _warnings(overall: StandingsSection, found: Results, table: Table) -> list[Statement]:
+    said = [_failed_data(found), _refuted(found, table)]
     other = states_of_rows(table, found) == OTHER_ACCURACY
     if other.any():
         asked = ", ".join(f"{value:.0e}" for value in np.unique(table["accuracy"][other]))
         said.append(Statement(FAIR, "Several accuracies", f"{plural(int(other.sum()), 'run')} asked for {asked}: they "
                               f"do not count beside those that suit {found.accuracy:.0e}; --accuracy compares at "
-                              "another one.", "solver"))
-    if overall.infeasible:
-        said.append(Statement(FAIR, "Infeasible problems", no_solution(overall), "solver"))
+                              "another one."))
+    if k := overall.infeasible:
+        said.append(Statement(FAIR, "Infeasible problems", f"{plural(k, 'problem')} {'has' if k == 1 else 'have'} no "
+                              "solution according to every solver that came to an answer. This counts neither for nor "
+                              "against them."))
     return [statement for statement in said if statement is not None]
 
 
@@ -147,16 +149,7 @@ def _failed_data(found: Results) -> Statement | None:
         return None
     why = found.reason[(keys == failed[0])[:, None] & error][0]
     text = f"Every run on {listed([key.partition(chr(0))[2] for key in failed])} ended with an error: {why[:200]}"
-    return Statement(BAD, "Data that failed", text.rstrip(".") + ".", "data sets")
-
-
-def _never(overall: StandingsSection) -> Statement | None:
-    never = [s for s in overall.standings if not s.solved]
-    if not never or len(never) == len(overall.standings):
-        return None
-    tried = "; ".join(f"{s.solver}: {plural(s.problems, 'problem')}, "
-                      + ", ".join(f"{word} {count:,}" for word, count in s.failures.items()) for s in never)
-    return Statement(BAD, "Never reached the accuracy", f"{tried}.", "solver")
+    return Statement(BAD, "Data that failed", text.rstrip(".") + ".")
 
 
 def _refuted(found: Results, table: Table) -> Statement | None:
@@ -174,7 +167,7 @@ def _refuted(found: Results, table: Table) -> Statement | None:
     p = int(np.flatnonzero(wrong)[0])
     return Statement(BAD, "A proof is contradicted", f"On {plural(int(wrong.sum()), 'problem')} a proved lower bound "
                      f"lies above an objective that another run verified, first on {found.data[p]}, "
-                     f"{found.formulation[p]}. One of the two is wrong: please report it.", "claims")
+                     f"{found.formulation[p]}. One of the two is wrong: please report it.")
 
 
 def _false_claims(table: Table, found: Results) -> tuple[FalseClaim, ...]:

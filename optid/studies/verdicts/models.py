@@ -6,8 +6,7 @@ import numpy as np
 
 from optid.studies.verdicts.averages import MINIMUM_PAIRS, means_of_groups, paired
 from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, TIE, Choice, choose
-from optid.studies.verdicts.outcomes import NOT_RUN, Results, Table
-from optid.studies.verdicts.ranks import SolverRanking, rank
+from optid.studies.verdicts.outcomes import Results, Table
 
 SMALLEST = 1e-12  # parameter errors below are roundoff
 WORST = -100.0  # %; a simulation that runs away must not decide a mean over all records
@@ -47,8 +46,6 @@ class Quality(DataSet):
     formulations: tuple[str, ...]
     measure: str  # column: the simulation fit, or the parameter error where more formulations have that on most records
     sets: tuple[DataSet, ...]  # the comparison on every data set
-    ranking: SolverRanking  # by the same over data sets
-    truth: bool  # whether the truth is known for some model
 
     @property
     def unit(self) -> str:
@@ -65,9 +62,8 @@ def compare_formulations(found: Results, table: Table) -> Quality:
     """Compare the models of the formulations, of results and the rows they come from, record by record."""
     names, number = np.unique(found.formulation, return_inverse=True)
     names, case, shape = tuple(names), found.case, (int(found.case.max(initial=-1)) + 1, len(names))
-    row, tried = np.full(shape, -1), np.zeros(shape, dtype=bool)
+    row = np.full(shape, -1)
     verified = found.verified  # a model without a time is a model
-    np.logical_or.at(tried, (case, number), np.any(found.state != NOT_RUN, axis=1))
     for p in np.flatnonzero(verified.any(axis=1)):
         best = int(np.nanargmin(np.where(verified[p], found.objective[p], np.nan)))
         row[case[p], number[p]] = found.row[p, best]
@@ -90,9 +86,7 @@ def compare_formulations(found: Results, table: Table) -> Quality:
     whole = DataSet("", *judged(np.ones(len(data), dtype=bool), None if len(sets) == 1 else data))
     if 1 < len(sets) < FEW:
         whole = replace(whole, choice=_of_few(sets, whole.choice, losses, names, data, errors))
-    return Quality(**vars(whole), formulations=names, measure=measure, sets=sets,
-                   ranking=rank(losses, tried, names, data, "formulation"),
-                   truth=bool(np.isfinite(values["parameter_error"]).any()))
+    return Quality(**vars(whole), formulations=names, measure=measure, sets=sets)
 
 
 def _data_sets(data: np.ndarray) -> dict[str, str]:

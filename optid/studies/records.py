@@ -6,7 +6,7 @@ import numpy as np
 
 from optid.data.record import Data
 from optid.errors import DataError
-from optid.studies.definition.description import DataEntry
+from optid.studies.definition import DataEntry
 from optid.studies.grid import Cell
 from optid.studies.sources.systems import simulate
 from optid.studies.sources.truth import Truth
