@@ -91,10 +91,10 @@ def _problem(window: BoundedWindow, signature: Any = None) -> Problem:
 def _proof(window: BoundedWindow, signature: Any, bounded: Array, exact: Array, bounds: Array,
            problem: Problem, values: Mapping[str, Array], duals: Mapping[str, Array]) -> tuple[Any, None]:
     """Return the factor that the multipliers of the noise prove."""
-    weights = np.zeros(bounds.size)
-    if np.size(duals.get("noise", ())) != 2 * bounded.size:
+    weights, within = np.zeros(bounds.size), np.asarray(duals.get("noise", ()), dtype=float)
+    if within.size != 2 * bounded.size:
         return prove_factor(window, signature, np.zeros(0), problem, values), None
-    upper, lower = np.split(np.asarray(duals["noise"], dtype=float), 2)
+    upper, lower = np.split(within, 2)
     weights[bounded] = (upper - lower) / bounds[bounded]
     if exact.size and np.size(duals.get("no noise", ())) == exact.size:
         weights[exact] = np.asarray(duals["no noise"], dtype=float)
