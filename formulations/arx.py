@@ -1,4 +1,11 @@
-"""Linear ARX ``A(q) y = sum_c B_c(q) u_c + d + e`` with constraints: the smallest example of a formulation."""
+"""Linear equations ``A(q) y = sum_c B_c(q) u_c + d + e`` with constraints: the smallest example of a formulation.
+
+    min over a, b, d:    ‖y - Phi [a; b; d]‖²  (+ sigma² bᵀ P^-1 b, of a finite response with a prior)
+
+Phi holds past outputs and inputs; only its products with itself and with y are needed. P is a kernel of stable
+responses (Chen, Ohlsson and Ljung 2012). With ``offset="each"`` an experiment has a constant of its own, which is
+eliminated; the mean of all remains as the unknown ``offset``.
+"""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,6 +1,11 @@
-"""Hammerstein-ARX: ``A(q) y = sum_c B_c(q) f_c(u_c) + d + e`` with ``f_c = mu_cᵀ eta_c``, the bilinear least squares.
+"""Hammerstein systems by equation errors, the bilinear least squares: ``A(q) y = sum_c B_c(q) f_c(u_c) + d + e``.
 
-* `exact`: in ``mu`` and ``b``, with the expression ``Theta = mu bᵀ``.
+    min over a, mu, b, d:    ‖y - Phi_y a - sum_c Phi_c vec(mu_c b_cᵀ) - d‖²,    f_c = mu_cᵀ eta_c
+
+Phi_y holds past outputs, Phi_c the functions eta_c of past inputs; only products of the columns are needed. A gauge
+such as ``‖b_c‖ = 1`` fixes the scale between mu and b; f rises where the output rises, unless constraints decide.
+
+* `exact`: in ``mu`` and ``b``, with the expression ``Theta = mu bᵀ``; proved by the dual of the rank-one constraint.
 * `nuclear`: convex in ``Theta``, a nuclear-norm penalty in place of the rank-one constraint.
 * `overparametrised`: convex in ``Theta``; the rank-one factor is split off afterwards (Bai 1998; Luo, Algorithm 3.1).
 

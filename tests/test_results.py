@@ -164,6 +164,15 @@ def test_the_stub_for_editors_is_that_of_the_signatures():
     assert STUB.read_text(encoding="utf-8") == stub(), "run python docs/stub.py"
 
 
+def test_the_page_on_mathematics_is_that_of_the_formulations():
+    sys.path.insert(0, "docs")
+    try:
+        from mathematics import PAGE, page
+    finally:
+        sys.path.remove("docs")
+    assert PAGE.read_text(encoding="utf-8") == page(), "run python docs/mathematics.py"
+
+
 def test_a_notebook_shows_a_record_and_a_verdict_as_tables():
     fit = example_fit("thruster")
     record = fit.data._repr_html_()
