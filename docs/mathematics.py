@@ -19,8 +19,8 @@ ORDER = ("arx", "hammerstein_arx", "prediction_error", "process", "hammerstein_s
 HEAD = """# Mathematics
 
 The problem that every formulation states, in the words of its file, which states the same as data: unknowns, terms of
-the objective, constraints. This page is written from the files by `docs/mathematics.py`. Proofs, intervals, prices and the
-judgement of answers are the same for all: [proofs, intervals and prices](proofs.md).
+the objective, constraints. This page is written from these files by `docs/mathematics.py`. Proofs, intervals, prices
+and the judgement of answers are the same for all: [proofs, intervals and prices](proofs.md).
 
 Records are $u(k) \\in \\mathbb{R}^m$, $y(k) \\in \\mathbb{R}^l$, $k = 1 \\dots N$, and $q^{-1}$ is the delay. A static
 function is $f_c(u) = \\eta_c(u)^T \\mu_c$ with basis functions $\\eta_c$; $\\Theta_c = \\mu_c b_c^T$.
@@ -40,7 +40,8 @@ def page() -> str:
         text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
         title, _, body = text.partition("\n")
         words = ", ".join(f"`{name}`" for name in sorted(names[module]))
-        parts.append(f"## {_prose(title)}\n\nFile `{path.relative_to(ROOT).as_posix()}`: {words}.\n\n{_markdown(body)}\n")
+        file = f"File `{path.relative_to(ROOT).as_posix()}`: {words}."
+        parts.append("\n\n".join([f"## {_prose(title)}", file, *_paragraphs(body)]) + "\n")
     return "\n".join(parts)
 
 
@@ -49,13 +50,9 @@ def _place(module: str) -> tuple[int, str]:
     return (ORDER.index(last) if last in ORDER else len(ORDER), last)
 
 
-def _markdown(body: str) -> str:
-    """Return the text of a docstring in Markdown: what is indented are formulas, unless it continues an item."""
-    return "\n\n".join(_paragraphs(body))
-
-
 def _paragraphs(body: str) -> Iterator[str]:
-    for paragraph in re.split(r"\n\s*\n", body.strip("\n")):
+    """Yield the paragraphs of a docstring in Markdown: what is indented are formulas."""
+    for paragraph in re.split(r"\n\s*\n", body.strip("\n")) if body.strip() else ():
         if paragraph.startswith("    "):
             yield f"```text\n{textwrap.dedent(paragraph)}\n```"
         else:
