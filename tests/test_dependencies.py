@@ -51,3 +51,12 @@ def test_importing_the_package_is_quick():
            "print(time.perf_counter() - n)"
     runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True) for _ in range(3)]
     assert min(float(run.stdout) for run in runs) < 0.3
+
+
+@pytest.mark.parametrize("package", ["pydantic", "tomlkit"])
+def test_studies_name_the_extra_that_they_need(package):
+    code = (f"import sys; sys.modules[{package!r}] = None\n"
+            "import optid, optid.errors\n"
+            "try:\n    optid.Study\nexcept optid.errors.StudyError as error:\n    print(error)")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert package in done.stdout and 'pip install "optid[study]"' in done.stdout
