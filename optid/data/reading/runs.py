@@ -140,7 +140,7 @@ def sample_evenly(runs: Sequence[RawRun], how: Format, dt: float | None
         if run.stamps is None:
             if run.step is not None:
                 step = agreed_step(run.step, step, how.time_tolerance, run.label)
-            if how.resample is not None or how.gaps is not None:
+            if how.resample is not None or how.gaps not in (None, "stamps"):  # there are no stamps to be kept
                 word = "resample" if how.resample is not None else "gaps"
                 raise DataError(f"{run.label} has no time column, which {word}= needs. Name it: time=.")
             evenly.append(Piece(0.0, run.u, run.y))
