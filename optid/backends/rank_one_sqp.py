@@ -5,7 +5,7 @@ by their tangents. A step for which the tangents are a poor model is corrected b
 convex.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,8 @@ import numpy as np
 from optid.arrays import Array
 from optid.backends.conic import solve_least_squares
 from optid.backends.rank_one_step import TINY, RankOneStep
+from optid.core.constraint import join_by_name
+from optid.core.least_squares import RankOneForm
 from optid.core.problem import Problem
 from optid.core.terms import Values, flat
 from optid.program.solution import Status
@@ -51,14 +53,11 @@ class RankOneSQP:
     def __init__(self, problem: Problem, start: Values, free: Point,
                  is_proved: Callable[[Values, Mapping[str, Array]], bool]) -> None:
         self.problem, self.start, self.free, self.is_proved = problem, start, free, is_proved
-        (self.squares,) = problem.bilinear_terms
-        assert self.squares.lifted is not None
-        self.lifted = self.squares.lifted
-        by_name = {product.name: product for product in problem.products}
-        self.products = [by_name[name] for name in self.squares.z if name in by_name]  # in the order of the blocks
-        self.linear = tuple(name for name in self.squares.z if name in problem.start)  # unknowns by themselves
+        form = RankOneForm.of(problem)
+        assert form is not None
+        self.form, self.lifted = form, form.problem
         self.model = RankOneStep(problem, self._values(free))
-        self.constraints = self.model.constraints
+        self.products, self.squares, self.constraints = self.model.products, self.model.squares, self.model.constraints
 
     def solve(self, seed: int, directions: int, descents: int) -> DescentEnd:
         """Try directions of b, follow the best ones to their ends, and return the best end."""
@@ -87,28 +86,18 @@ class RankOneSQP:
 
     # -- points
 
-    def _point(self, x: Values) -> Point:
-        return to_point(self.problem, self.linear, x)
-
     def _values(self, point: Point) -> dict[str, Array]:
         """Return the values of a point, in the gauge."""
-        found, at = {}, 0
-        for name in self.linear:
-            size = np.size(self.problem.start[name])
-            found[name] = np.reshape(point.w[at : at + size], np.shape(self.problem.start[name]), order="F")
-            at += size
-        for product, mu, b in zip(self.products, point.mus, point.bs):
-            found[product.mu] = np.reshape(mu, np.shape(self.problem.start[product.mu]), order="F")
-            found[product.b] = np.reshape(b, np.shape(self.problem.start[product.b]), order="F")
-        return self.problem.in_gauge({name: found[name] for name in self.problem.start})
+        shapes = {name: np.shape(value) for name, value in self.problem.start.items()}
+        return self.problem.in_gauge(self.form.named(point, shapes))
 
     def _lift(self, x: Values) -> Array:
-        return np.concatenate([flat(part) for part in map(self.problem.leaf_values(x).__getitem__, self.squares.z)])
+        return self.form.point(x).lift()
 
     def _candidates(self, seed: int, most: int) -> list[dict[str, Array]]:
         """Points with different directions of b, each with every pattern of signs."""
         core, free = self.lifted.core, self.free
-        points = [self._point(self.start)]
+        points = [self.form.point(self.start)]
         if most > DIRECTIONS:  # under signs of b an optimum may lie on one lag alone, and mu vanish all around it
             points = [Point(free.w, free.mus, (*free.bs[:i], axis, *free.bs[i + 1 :]))
                       for i, b in enumerate(free.bs) for axis in np.eye(b.size)] + points
@@ -125,10 +114,7 @@ class RankOneSQP:
         for point in sign_patterns(self.free):
             x = self._values(point)
             if self.problem.violation(x, self.constraints) <= INSIDE and self._in_gauge(x):
-                sizes = {one.name: 0 for one in self.constraints}
-                for one in self.constraints:
-                    sizes[one.name] += len(one)
-                duals: dict[str, Array] = {name: np.zeros(size) for name, size in sizes.items()}
+                duals = join_by_name(self.constraints, [np.zeros(len(one)) for one in self.constraints])
                 return DescentEnd(0.0, x, duals, Status.LOCAL, "stationary; no constraint is active", 0)
         return None
 
@@ -210,15 +196,7 @@ class RankOneSQP:
             x, damping = new, 0.1 * damping if damping > 1e-9 else 0.0
             if size < 1e-9 or (size < 1e-7 and before - after <= 1e-13 * (before + floor)):
                 status, word = Status.LOCAL, "stationary"
-        return DescentEnd(self._merit(x, weight), x, self.model.multipliers(x, duals), status, word, count)
-
-def to_point(problem: Problem, linear: Sequence[str], x: Values) -> Point:
-    """Return the values of a problem as a point of its rank-one least squares."""
-    (squares,) = problem.bilinear_terms
-    products = {product.name: product for product in problem.products}
-    ordered = [products[name] for name in squares.z if name in products]
-    return Point(np.concatenate([*(flat(x[name]) for name in linear), np.zeros(0)]),
-                 tuple(flat(x[one.mu]) for one in ordered), tuple(flat(x[one.b]) for one in ordered))
+        return DescentEnd(self._merit(x, weight), x, duals, status, word, count)
 
 
 def sign_patterns(point: Point) -> Iterator[Point]:

@@ -19,14 +19,13 @@ from optid.arrays import Array
 from optid.backends.back_end import Answer, Settings
 from optid.backends.conic import SHARP, solve_least_squares, tolerances
 from optid.core.constraint import Constraint, join_by_name
-from optid.core.judge import ACTIVE, gauges, sizes_of_terms
+from optid.core.judge import gauges
 from optid.core.leaves import Product
 from optid.core.problem import Problem
 from optid.core.terms import Values, flat
 from optid.program.expressions import solve_quietly
 from optid.program.limits import EQUALITIES
 from optid.program.solution import Status
-from optid.structures.multipliers import fit_multipliers
 
 TINY = 1e-300
 GAUGE = "gauge"  # under which the multipliers of the gauges stand beside those of the constraints
@@ -182,35 +181,6 @@ class RankOneStep:
         found = [tangent if one.cone == "zero" else tangent[part > 1e-6 * largest]
                  for (one, tangent, _), part in zip(rows, parts)]
         return np.vstack([*(gauge for gauge, _ in gauges(self.problem, x)), *found])
-
-    def multipliers(self, x: Values, found: dict[str, Array]) -> dict[str, Array]:
-        """Return multipliers at x: those of the last step, or fitted to the gradient where that leaves less of it.
-
-        A step has multipliers for the point that it reaches, which differ where it moved a b that means nothing.
-        """
-        parts = _parts(self.constraints, found)
-        if parts is None or not all(one.cone in ("zero", "below") for one in self.constraints):
-            return found
-        problem, y, slope = self.problem, self.problem.leaf_values(x), self.problem.slope(x)
-        jacobian = self._jacobian(slope)
-        gradient = 2.0 * jacobian.T @ self.squares.residual(y)
-        units = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
-        held = [gauge * units for gauge, _ in gauges(problem, x)]
-        rows = np.vstack([np.zeros((0, problem.size)), *(one.rows @ slope * units for one in self.constraints)])
-        equal = np.concatenate([np.full(len(one), one.cone == "zero") for one in self.constraints])
-        active = np.concatenate([(g := one.residual(problem.space, y)) > -ACTIVE * sizes_of_terms(
-            one, one.rows, g, problem.space, y)[0]
-                                 for one in self.constraints]) | equal
-        gauged, fitted = np.array(held).reshape(-1, problem.size), np.zeros(len(rows))
-        both = np.vstack([gauged, rows[active]])
-        weights, rest = fit_multipliers(both, -gradient * units, np.r_[np.full(len(gauged), True), equal[active]])
-        fitted[active] = weights[len(gauged) :]
-        left = rows.T @ np.concatenate(parts) + gradient * units
-        left = left - gauged.T @ np.linalg.lstsq(gauged.T, left)[0]
-        if rest >= np.linalg.norm(left):
-            return found
-        edges = np.cumsum([len(one) for one in self.constraints])[:-1]
-        return join_by_name(self.constraints, np.split(fitted, edges))
 
 
 def _parts(constraints: Sequence[Constraint], duals: Mapping[str, Array]) -> list[Array] | None:

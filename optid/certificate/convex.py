@@ -17,6 +17,7 @@ from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
 from optid.certificate.lifting import lift
+from optid.core.constraint import join_by_name
 from optid.core.judge import in_dual_cone, rows_at
 from optid.core.least_squares import LeastSquaresForm, LinearForm
 from optid.core.problem import Problem
@@ -158,7 +159,6 @@ def _own_multipliers(problem: Problem, form: LeastSquaresForm) -> dict[str, Arra
         return None
     if weights is None:
         return None
-    counts = {one.name: 0 for one in problem.constraints()}
-    for one in problem.constraints():
-        counts[one.name] += len(one)
-    return dict(zip(counts, np.split(2.0 * size * weights / lengths, np.cumsum([*counts.values()])[:-1])))
+    held = problem.constraints()
+    edges = np.cumsum([len(one) for one in held])[:-1]
+    return join_by_name(held, np.split(2.0 * size * weights / lengths, edges))

@@ -188,7 +188,7 @@ class ConstraintReader:
     convex: bool
     about: frozenset[str] = frozenset()
 
-    def read(self, own: Sequence[Any], builders: Sequence[Any], about: Values, further: Mapping[str, Any],
+    def read(self, own: Sequence[Any], builders: Sequence[Any], about: Values, shown: Mapping[str, Any],
              only: set[int] | None = None) -> list[Constraint]:
         """Read builders about a point, all or some by their positions.
 
@@ -196,14 +196,13 @@ class ConstraintReader:
             own: those of the formulation.
             builders: those of the user: callables of the `View`, or what they would return.
             about: the reference, where the facts have none.
-            further: expressions besides the leaves.
+            shown: the expressions that they may use.
             only: positions, among both.
 
         Raises:
             StructureError: an unknown variable, a name used twice, a constraint that is not convex but has to be.
         """
         reference = Reference(self.facts.get("reference", about))
-        shown = {name: one for name, one in {**self.space.variables, **further}.items() if one is not None}
         view = _NotingView(shown, **{**self.facts, "reference": reference})
         found: list[Constraint] = []
         convex = self.convex

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.arrays import Array, largest
-from optid.core.constraint import Constraint, largest_eigenvalue, symmetric_part
+from optid.core.constraint import Constraint, join_by_name, largest_eigenvalue, symmetric_part
 from optid.core.leaves import LeafSpace
 from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, Length, NuclearNorms, Values, flat
@@ -121,11 +121,8 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
         again = lagrangian.measure(rows, own)
         if not again[0] >= best[0]:
             given, best, fitted = own, again, True
-    named: dict[str, list[Array]] = {}
-    for row, part in zip(rows, given or ()):
-        named.setdefault(row.constraint.name, []).append(part)
-    return Judgement(lagrangian.value, Residuals(violation, worst, *best),
-                     {name: np.concatenate(parts) for name, parts in named.items()}, fitted,
+    named = {} if given is None else join_by_name([row.constraint for row in rows], given)
+    return Judgement(lagrangian.value, Residuals(violation, worst, *best), named, fitted,
                      lagrangian.gauge_multipliers(rows, given or ()))
 
 

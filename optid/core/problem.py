@@ -219,13 +219,15 @@ class Problem:
             found = product.in_gauge(found)
         return found
 
+    def expressions(self, leaves: Mapping[str, Any], x: Values) -> dict[str, Any]:
+        """Return what constraints about a point may use, in expressions of the leaves and in units of the problem."""
+        further = {} if self.further is None else self.further(leaves, x)
+        return {name: one for name, one in {**leaves, **further}.items() if one is not None}
+
     def shown(self, x: Values) -> dict[str, Array]:
         """Return the values at a point of everything that constraints may use, in the units of the record."""
-        variables = self.space.variables
         self.space.assign(self.leaf_values(x))
-        further = {} if self.further is None else self.further(variables, x)
-        inner = {name: one for name, one in {**variables, **further}.items() if one is not None}
-        view = View(inner, **{"reference": x, **self.facts})
+        view = View(self.expressions(self.space.variables, x), **{"reference": x, **self.facts})
         return {name: np.asarray(expression.value, dtype=float) for name, expression in view.items()}
 
     # -- values and slopes
@@ -281,9 +283,8 @@ class Problem:
     # -- constraints
 
     def _read(self, x: Values, only: set[int] | None = None) -> list[Constraint]:
-        further = {} if self.further is None else self.further(self.space.variables, x)
         reader = ConstraintReader(self.name, self.space, self.facts, self.has_convex_terms, self.about)
-        return reader.read(self.restrictions, self.builders, x, further, only)
+        return reader.read(self.restrictions, self.builders, x, self.expressions(self.space.variables, x), only)
 
     @cached_property
     def _at_start(self) -> tuple[Constraint, ...]:

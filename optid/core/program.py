@@ -75,9 +75,7 @@ class CvxpyStatement:
         for one in problem.constraints():
             member = one.limit.posed(one.sizes).tree_copy(swap)
             constraints[one.name] = (*constraints.get(one.name, ()), member)
-        further = {} if problem.further is None else problem.further(leaves, problem.start)
-        shown = {name: one for name, one in {**leaves, **further}.items() if one is not None}
-        view = View(shown, **{"reference": problem.start, **problem.facts})
+        view = View(problem.expressions(leaves, problem.start), **{"reference": problem.start, **problem.facts})
         return cls(cp.Minimize(sum_of(parts)), constraints, variables, derived, view)
 
 
@@ -189,11 +187,6 @@ class Program:
     def user_constraints(self) -> tuple[str, ...]:
         """Names of the constraints that are not part of the formulation itself."""
         return self.core.constraint_names
-
-    @property
-    def is_restricted(self) -> bool:
-        """Whether anything but gauges restricts the unknowns, which methods for its structure alone do not know."""
-        return bool(self.core.bounds) or any(one.name != GAUGE for one in self.core.constraints())
 
     @property
     def own(self) -> dict[str, int]:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.core.constraint import Constraint, symmetric_part
+from optid.core.judge import gauges
 from optid.core.problem import Problem
 from optid.core.terms import Values
 from optid.errors import RankError, StructureError
@@ -234,11 +235,7 @@ def constraint_rows(problem: Problem, x: Values, names: tuple[str, ...]) -> tupl
     y, slope = problem.leaf_values(x), problem.slope(x)[:, columns]
     nothing = np.zeros((0, columns.size))
     equal, above, slack = [nothing], [nothing], [np.zeros(0)]
-    for product in problem.gauged:
-        row = np.zeros((1, problem.size))
-        for name, part in product.level(x)[1].items():
-            row[0, problem.slices[name]] = part
-        equal.append(row[:, columns])
+    equal += [gauge[None, columns] for gauge, _ in gauges(problem, x)]
     for one in problem.constraints(x):
         if one.leaves(problem.space) & problem.courses:
             continue

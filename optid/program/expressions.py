@@ -4,7 +4,7 @@ import ctypes
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -232,12 +232,6 @@ def differences(function: Map, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         moved[j] += step
         jacobian[:, j] = (function(moved) - base) / (moved[j] - x[j])
     return jacobian, base
-
-
-def side_by_side(slopes: Mapping[cp.Variable, Any], variables: Iterable[cp.Variable], rows: int) -> np.ndarray:
-    """Return Jacobians as one array (rows, sizes of the variables), zero for variables that have none."""
-    parts = [slopes.get(variable, np.zeros((rows, variable.size))) for variable in variables]
-    return np.hstack([part.toarray() if sp.issparse(part) else part for part in parts])
 
 
 def affine_parts(expression: cp.Expression) -> tuple[dict[cp.Variable, Any], np.ndarray] | None:
