@@ -62,8 +62,7 @@ def _shift(step: ShiftStep, rules: Sequence[Rule], given: tuple[np.ndarray, np.n
     tolerance.
     """
     n = len(step.basis)
-    common: dict[str, Any] = {"model": step.recover, "facts": {"reference": {"A": step.free}}, "scale": step.size,
-                              "energy": step.size}
+    common: dict[str, Any] = {"model": step.recover, "facts": {"reference": {"A": step.free}}, "scale": step.size}
     if given is None:
         contracted = step.free * min(1.0, 0.5 / max(np.max(np.abs(np.linalg.eigvals(step.free))), 1e-12))
         root = np.hstack([-np.kron(step.change.T, step.low), np.kron(step.change.T, step.top)])

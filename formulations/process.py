@@ -93,7 +93,7 @@ def _problem(errors: ProcessErrors, x: Array) -> Problem:
         further=partial(_signals, errors), model=errors.model,
         facts={"iterate": True, "channels": data.inputs, "outputs": data.outputs,
                "bases": dict(zip(data.inputs, errors.outer_bases))},
-        scale=errors.energy, unit=errors.unit, energy=errors.unit * errors.energy_of_record)
+        **errors.common())
 
 
 def _signals(errors: ProcessErrors, variables: Mapping[str, Any], _: Any) -> dict[str, Any]:

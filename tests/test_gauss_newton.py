@@ -109,7 +109,7 @@ def test_three_channels_with_constraints():
 def test_the_step_model_is_the_second_order_expansion_of_the_lagrangian():
     """Against finite differences, at a point with multipliers for a bilinear constraint."""
     problem = program_of(record(), [shape.gain(1.0, at=0.1)])
-    steps = RankOneSQP(problem, problem.start, minimise(problem.terms[0].lifted).point, lambda x, duals: False).model
+    steps = RankOneSQP(problem, problem.start, minimise(problem.terms[0].lifted).point, lambda x: False).model
     rng = np.random.default_rng(0)
     x, pull = rng.normal(size=problem.size), rng.normal(size=problem.space.size)
 

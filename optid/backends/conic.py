@@ -191,6 +191,19 @@ def _has_rows_alone(program: Program) -> bool:
     return problem.is_in_rows
 
 
+def sizes_by_effect(problem: Problem, matrix: np.ndarray) -> np.ndarray:
+    """Return how much of every unknown would account for the whole record, by its largest effect; (unknowns,).
+
+    Solvers stop at absolute tolerances, so programmes are written in these units and not in those of the data. The
+    matrix (k, unknowns) is the slope of the residuals.
+    """
+    effect, reach, sizes = np.linalg.norm(matrix, axis=0), float(np.sqrt(problem.scale)), np.ones(problem.size)
+    for place in problem.slices.values():
+        most = float(np.max(effect[place], initial=0.0))
+        sizes[place] = reach / most if most > 0 and reach > 0 else 1.0
+    return sizes
+
+
 def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
     """Solve such a problem, in units in which the record accounts for every unknown."""
     (squares,) = problem.terms
@@ -198,13 +211,9 @@ def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
     places, slope = problem.slices, problem.slope(problem.start)
     level = problem.space.vector(problem.leaf_values(problem.start)) - slope @ problem.pack(problem.start)
     columns = np.concatenate([np.arange(places[name].start, places[name].stop) for name in squares.z])
-    effect, reach = np.linalg.norm(squares.root, axis=0), float(np.sqrt(problem.scale))
-    sizes = np.ones(problem.size)
-    for place in places.values():
-        most = float(np.max(effect[np.isin(columns, np.arange(place.start, place.stop))], initial=0.0))
-        sizes[place] = reach / most if most > 0 and reach > 0 else 1.0
     matrix = np.zeros((len(squares.root), problem.size))
     matrix[:, columns] = squares.root
+    sizes = sizes_by_effect(problem, matrix)
     unit = max(float(np.max(np.abs(matrix * sizes))), np.finfo(float).tiny)
     held, units = sorted(problem.constraints(), key=lambda one: CONES.index(one.cone)), []
     sides: dict[str, list[Side]] = {cone: [] for cone in CONES}

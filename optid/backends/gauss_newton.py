@@ -43,7 +43,7 @@ def _constrained(program: Program, free: Point, seed: int, directions: int, desc
     """Solve the problem of the core that a programme states."""
     problem: Problem = program.core
 
-    def is_proved(x: Values, duals: Values) -> bool:
+    def is_proved(x: Values) -> bool:
         return certify_rank_one(problem, x, max_size=0)[0].proved
 
     end = RankOneSQP(problem, program.start, free, is_proved).solve(seed, directions, descents)

@@ -5,7 +5,7 @@ by their tangents. A step for which the tangents are a poor model is corrected b
 convex.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,11 +47,11 @@ class RankOneSQP:
         problem: one term of squares with products, under constraints that do not depend on an iterate.
         start: where to begin.
         free: the minimum without the constraints.
-        is_proved: whether a point and its multipliers are quickly proved to be the global minimum.
+        is_proved: whether a point is quickly proved to be the global minimum.
     """
 
     def __init__(self, problem: Problem, start: Values, free: Point,
-                 is_proved: Callable[[Values, Mapping[str, Array]], bool]) -> None:
+                 is_proved: Callable[[Values], bool]) -> None:
         self.problem, self.start, self.free, self.is_proved = problem, start, free, is_proved
         form = RankOneForm.of(problem)
         assert form is not None
@@ -80,7 +80,7 @@ class RankOneSQP:
         ends = []
         for x in distinct[:descents]:
             ends.append(self._descend(x))
-            if ends[-1].status is Status.LOCAL and self.is_proved(ends[-1].x, ends[-1].duals):
+            if ends[-1].status is Status.LOCAL and self.is_proved(ends[-1].x):
                 break
         return min(ends, key=lambda end: end.merit)
 

@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
 from optid.backends.back_end import Answer, Settings
-from optid.backends.conic import SHARP, solve_least_squares, tolerances
+from optid.backends.conic import SHARP, sizes_by_effect, solve_least_squares, tolerances
 from optid.core.constraint import Constraint, join_by_name
 from optid.core.judge import gauges
 from optid.core.leaves import Product
@@ -25,10 +25,10 @@ from optid.core.problem import Problem
 from optid.core.terms import Values, flat
 from optid.program.expressions import solve_quietly
 from optid.program.limits import EQUALITIES
+from optid.program.sizes import GAUGE
 from optid.program.solution import Status
 
 TINY = 1e-300
-GAUGE = "gauge"  # under which the multipliers of the gauges stand beside those of the constraints
 
 
 class RankOneStep:
@@ -66,16 +66,8 @@ class RankOneStep:
 
     @cached_property
     def sizes(self) -> Array:
-        """How much of every unknown would account for the whole record, by its largest effect; (unknowns,).
-
-        Solvers stop at absolute tolerances, so the programmes are written in these units and not in those of the data.
-        """
-        effect = np.linalg.norm(self._jacobian(self.problem.slope(self.usual)), axis=0)
-        reach, sizes = float(np.sqrt(self.problem.scale)), np.ones(self.problem.size)
-        for place in self.problem.slices.values():
-            most = float(np.max(effect[place], initial=0.0))
-            sizes[place] = reach / most if most > 0 and reach > 0 else 1.0
-        return sizes
+        """Units of the unknowns (unknowns,), by their effect."""
+        return sizes_by_effect(self.problem, self._jacobian(self.problem.slope(self.usual)))
 
     @cached_property
     def _z(self) -> NDArray[np.intp]:

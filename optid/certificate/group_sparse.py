@@ -13,7 +13,6 @@ from optid.core.judge import in_dual_cone
 from optid.core.problem import Problem
 from optid.core.terms import Values
 from optid.program.solution import Bound, relative_gap
-from optid.structures.group_sparse import GroupProblem
 
 PROVED = 1e-6
 """Relative gap below which a point is optimal."""
@@ -28,25 +27,12 @@ def certify_groups(problem: Problem, values: Values, duals: Values) -> Bound:
     if (given := form.dual_point(duals)) is not None:
         candidates.append(given)
     slope, constant = _lagrangian(problem, form, duals)
-    bounds = [_bound(numbers, v, form.penalty, slope, constant) for v in candidates]
-    bounds += [_bound(numbers, v, form.penalty, 0.0 * slope, 0.0) for v in candidates]
+    bounds = [numbers.dual(v, form.penalty, slope, constant) for v in candidates]
+    bounds += [numbers.dual(v, form.penalty) for v in candidates]
     value, point = max(bounds, key=lambda pair: pair[0])
     gap = relative_gap(numbers.value(a, form.penalty), value, problem.scale)
     return Bound(value, gap < PROVED, "group-sparse dual", f"feasible dual point, relative gap {gap:.1e}",
                  multipliers=point)
-
-
-def _bound(numbers: GroupProblem, v: Array, penalty: float, slope: Array, constant: float) -> tuple[float, Array]:
-    """Scale v and the multipliers into the feasible set and return the value there."""
-    if not np.isfinite(v).all():
-        return -np.inf, np.zeros_like(v)
-    most = float(np.max(numbers.norms(numbers.design.T @ v - slope) / (penalty * numbers.weights), initial=0.0))
-    square, along = float(v @ v), float(numbers.target @ v) + constant
-    best = 0.0 if square == 0.0 else max(along, 0.0) / square
-    scale = best if most == 0.0 else min(best, 1.0 / most)
-    if not scale > 0 or not np.isfinite(scale):  # also a most or along that is not a number
-        return 0.0, np.zeros_like(v)
-    return scale * along - 0.5 * scale**2 * square, scale * v
 
 
 def _lagrangian(problem: Problem, form: GroupSparseForm, duals: Values) -> tuple[Array, float]:

@@ -328,19 +328,28 @@ def _fitted(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], lagrangian
     units = np.ones(problem.size)
     for name, place in problem.slices.items():
         units[place] = variable_size(x[name], problem.space.usual_sizes.get(name))
-    held = [gauge[None] for gauge, _ in gauges(problem, x)]
     if _size(problem, rows) > LARGEST or not np.all(np.isfinite(lagrangian.gradient)):
         return None
-    parts = [row.gradients() for row in rows]
-    slopes = np.vstack([np.zeros((0, problem.size)), *held, *(slope for slope, _ in parts)])
-    equal = np.concatenate([np.ones(len(held), dtype=bool), *(
-        np.full(len(slope), row.constraint.is_equality) for row, (slope, _) in zip(rows, parts))])
+    slopes, equal, parts = active_slopes(lagrangian, rows)
     try:
         weights, _ = fit_multipliers(slopes * units, -lagrangian.gradient * units, equal)
     except (RuntimeError, ValueError):  # the iterations did not suffice, or products left the range of numbers
         return None
-    counts = np.cumsum([len(held), *(len(slope) for slope, _ in parts)])
-    return [weights[a:b] @ stands for a, b, (_, stands) in zip(counts, counts[1:], parts)]
+    counts = np.cumsum([len(problem.gauged), *map(len, parts)])
+    return [weights[a:b] @ stands for a, b, stands in zip(counts, counts[1:], parts)]
+
+
+def active_slopes(lagrangian: LagrangianAtPoint, rows: Sequence[RowsAtPoint]) -> tuple[Array, Array, list[Array]]:
+    """Return the slopes (k, unknowns) of the gauges and of what is active, and which of them are equalities.
+
+    Third, by constraint, the multipliers that one unit of each stands for.
+    """
+    parts = [row.gradients() for row in rows]
+    held = [gauge[None] for gauge, _ in lagrangian.gauges]
+    slopes = np.vstack([np.zeros((0, lagrangian.problem.size)), *held, *(slope for slope, _ in parts)])
+    equal = np.concatenate([np.ones(len(held), dtype=bool), *(
+        np.full(len(slope), row.constraint.is_equality) for row, (slope, _) in zip(rows, parts))])
+    return slopes, equal, [stands for _, stands in parts]
 
 
 def _size(problem: Problem, rows: Sequence[RowsAtPoint]) -> int:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain
 from math import prod
 from typing import Any, ClassVar
 
@@ -27,11 +26,6 @@ class LeastSquaresForm(Form):
     linear: tuple[str, ...]  # names of the linear variables in the order of z (each flattened column by column)
     blocks: tuple[tuple[str, str], ...] = ()  # (mu name, b name) of every rank-one block; none without products
     gauge: str = "norm"  # what fixes the scale between mu and b: "norm", "gain" or "b0"
-
-    @property
-    def names(self) -> list[str]:
-        """Names of all variables: the linear ones, then mu and b of every block."""
-        return [*self.linear, *chain.from_iterable(self.blocks)]
 
     def flat(self, values: Mapping[str, Any]) -> Array:
         """Return the linear variables among named values as they follow one another in z."""

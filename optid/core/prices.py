@@ -9,7 +9,7 @@ from scipy.sparse import issparse
 
 from optid.arrays import Array
 from optid.core.constraint import symmetric_part
-from optid.core.judge import ACTIVE, LagrangianAtPoint, RowsAtPoint, gauges, rows_at
+from optid.core.judge import ACTIVE, LagrangianAtPoint, RowsAtPoint, active_slopes, rows_at
 from optid.core.problem import Problem
 from optid.core.terms import Values
 from optid.program.limits import slope_of
@@ -104,17 +104,14 @@ def least_multipliers(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], 
         return None
     lagrangian = LagrangianAtPoint.of(problem, x)
     floor = lagrangian.floor()
-    held = [gauge for gauge, _ in gauges(problem, x)]
-    parts = [row.gradients() for row in rows]
-    columns = np.vstack([np.zeros((0, problem.size)), *(gauge[None] for gauge in held), *(part for part, _ in parts)])
-    equality = np.concatenate([np.ones(len(held), dtype=bool), *(
-        np.full(len(part), row.constraint.is_equality) for row, (part, _) in zip(rows, parts))])
-    places = [(GAUGE, slice(k, k + 1), np.ones(1)) for k in range(len(held))]
-    for row, (_, stands) in zip(rows, parts):
+    columns, equality, parts = active_slopes(lagrangian, rows)
+    count = len(problem.gauged)
+    places = [(GAUGE, slice(k, k + 1), np.ones(1)) for k in range(count)]
+    for row, stands in zip(rows, parts):
         places += [(row.constraint.name, row.constraint.span, direction) for direction in stands]
     known = [duals.get(row.constraint.name, np.zeros(0)) for row in rows]
     weights = lagrangian.gauge_multipliers(rows, [
         part[row.constraint.span] for row, part in zip(rows, known)]
-    ) if all(part.size for part in known) else np.zeros(len(held))
+    ) if all(part.size for part in known) else np.zeros(count)
     return exchange_multipliers(columns / floor, equality, places, -lagrangian.gradient / floor,
                                 {**duals, GAUGE: weights})

@@ -89,11 +89,6 @@ class Problem:
         """Return the problem with further constraints, which are read when they are first needed."""
         return replace(self, builders=(*self.builders, *builders))
 
-    def without(self, *names: str) -> "Problem":
-        """Return the problem without the builders of named constraints."""
-        dropped, own = {one.builder for one in self.constraints() if one.name in names}, len(self.restrictions)
-        return replace(self, builders=tuple(b for k, b in enumerate(self.builders, own) if k not in dropped))
-
     def tangent(self, x: Values, squares: Squares, compressed: Any) -> "Problem":
         """Return the convex problem of a step from a point: squares in the unknowns, leaves and gauges to first order.
 
@@ -175,12 +170,6 @@ class Problem:
         return not self.bilinear_terms and not any(
             isinstance(term, Errors) or isinstance(term, Expressed) and not term.build(self.space.variables).is_convex()
             for term in self.terms)
-
-    @property
-    def is_convex(self) -> bool:
-        """Whether all terms and all structural constraints are convex in the unknowns."""
-        return self.has_convex_terms and (not self.restrictions or all(
-            one.cone != "other" or one.limit.member.is_dcp() for one in self._at_start if self._is_own(one)))
 
     # -- layout
 

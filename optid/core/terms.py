@@ -96,10 +96,6 @@ class Squares:
         return Pull(float(r @ r) + self.remainder, split(2 * r @ self.root, y, self.z),
                     split(2 * np.abs(r) @ abs(self.root), y, self.z))
 
-    def tangent(self, y: Values) -> "Squares":
-        """Return the term itself: it is least squares already."""
-        return self
-
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
         return cp.sum_squares(self.root @ stacked_expression(v, self.z) - self.target) + self.remainder
@@ -192,10 +188,6 @@ class NuclearNorms:
         left, size, right = np.linalg.svd(beside, full_matrices=False)
         return weight * u @ vt + (left * np.minimum(size, weight)) @ right
 
-    def excess(self, name: str, part: Array) -> float:
-        """Return how often a dual part in the leaf's shape exceeds the ball of the dual norm."""
-        return float(np.linalg.norm(part, 2)) / max(self.weights[name], TINY)
-
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
         return sum_of([t * cp.normNuc(v[name]) for name, t in self.weights.items()])
@@ -221,10 +213,6 @@ class GroupNorms:
         inside = -pull * np.minimum(1.0, weight / np.maximum(most, TINY))
         there = (size > EMPTY * max(float(size.max()), TINY)) & (size * (weight + most) > rest)
         return np.where(there, weight * value / np.maximum(size, TINY), inside)
-
-    def excess(self, name: str, part: Array) -> float:
-        """Return how often a dual part in the leaf's shape exceeds the ball of the dual norm."""
-        return float(np.max(np.linalg.norm(part, axis=-1) / np.maximum(self.weights[name], TINY)))
 
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
@@ -256,10 +244,6 @@ class Errors:
     def pull(self, y: Values) -> Pull:
         """Return value and gradient."""
         return self.linearise(y).pull(y)
-
-    def tangent(self, y: Values) -> Squares:
-        """Return the errors to first order about a point."""
-        return self.linearise(y)
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,13 +69,20 @@ class GroupProblem:
         """Return the smallest penalty at which everything is zero."""
         return float(np.max(self.norms(self.design.T @ self.target) / self.weights))
 
-    def dual(self, v: Array, penalty: float) -> tuple[float, Array]:
-        """Return the value of the dual and the best feasible multiple of v (m,), usually the residual of a point."""
-        most = float(np.max(self.norms(self.design.T @ v) / (penalty * self.weights), initial=0.0))
-        best = float(self.target @ v) / max(float(v @ v), np.finfo(float).tiny)
-        point = v * (best if most == 0 else float(np.clip(best, -1 / most, 1 / most)))
-        rest = self.target - point
-        return 0.5 * float(self.target @ self.target) - 0.5 * float(rest @ rest), point
+    def dual(self, v: Array, penalty: float, slope: Array | float = 0.0, constant: float = 0.0) -> tuple[float, Array]:
+        """Return the value of the dual and the best feasible multiple of v (m,), usually the residual of a point.
+
+        Multipliers of affine constraints add ``slope' a + constant`` to the objective, and are scaled with v.
+        """
+        if not np.isfinite(v).all():
+            return -np.inf, np.zeros_like(v)
+        most = float(np.max(self.norms(self.design.T @ v - slope) / (penalty * self.weights), initial=0.0))
+        square, along = float(v @ v), float(self.target @ v) + constant
+        best = 0.0 if square == 0.0 else max(along, 0.0) / square
+        scale = best if most == 0.0 else min(best, 1.0 / most)
+        if not scale > 0 or not np.isfinite(scale):  # also a most or along that is not a number
+            return 0.0, np.zeros_like(v)
+        return scale * along - 0.5 * scale**2 * square, scale * v
 
     def certainly_zero(self, point: Array, gap: float, penalty: float) -> np.ndarray:
         """Return which groups (G,) are zero in every minimiser, from a feasible point (m,) of the dual.
