@@ -80,6 +80,7 @@ class Decisions:
     # [candidate, labels] of carried actuators whose kind is not decided yet
     undecided: list[list[Any]] = field(default_factory=list)
     told: list[str] = field(default_factory=list)  # labels of the last isolated fault
+    onsets: list[list[int]] = field(default_factory=list)  # [candidate, first sample] of the carried faults
     kept: list[Array] | None = None  # the statistics (T, C) of all samples, where they are requested
 
     common: float = float("nan")  # energy over its threshold that a tenth of the simulated windows reach
@@ -88,7 +89,7 @@ class Decisions:
     adapted: float = 1.0  # factor of the thresholds for the colour of the noise
 
     KEPT = ("phase", "alarm", "named", "named_at", "quiet", "begun", "raised", "passing", "undecided", "told",
-            "highest", "windows", "adapted")
+            "onsets", "highest", "windows", "adapted")
 
     @cached_property
     def groups(self) -> tuple[int, ...]:
@@ -258,6 +259,7 @@ class Decisions:
         if family and (len(labels) > 1 or not self.columns.candidates[chosen].additive):
             chosen = family[0]
             self.undecided = [one for one in self.undecided if one[0] != chosen] + [[chosen, labels]]
+        self.onsets = [one for one in self.onsets if one[0] != chosen] + [[chosen, now - int(window.peak[chosen]) + 1]]
         plant.room(2 * int(self.columns.size.max()))
         left = plant.carry(chosen, window)
         if np.isfinite(left):
@@ -348,6 +350,7 @@ class Decisions:
         for number, (owner, until) in enumerate(self.passing):
             if now >= until:
                 del self.passing[number]
+                self.onsets = [one for one in self.onsets if one[0] != owner]
                 return Event("cleared", now, ((self.labels[owner], 1.0),))
         n = plant.model.nx
         for owner in dict.fromkeys(one.owner for one in plant.directions):
@@ -362,7 +365,8 @@ class Decisions:
             energy = float(sizes @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ sizes)
             if energy < self.rules["forgiven"] * self.q[owner]:
                 plant.release(rows, own, window)
-                self.undecided = [one for one in self.undecided if one[0] != owner]
+                self.undecided, self.onsets = ([one for one in kept if one[0] != owner]
+                                               for kept in (self.undecided, self.onsets))
                 return Event("cleared", now, ((self.labels[owner], 1.0),))
             if event := self._revise(now, owner, sizes, covariance):
                 return event

@@ -59,10 +59,12 @@ class Carried:
     """An isolated fault whose effect is compensated."""
 
     label: str  # the candidate
-    size: tuple[float, ...]  # its magnitudes
+    size: tuple[float, ...]  # its magnitudes, as in `Dictionary.signature`
     deviation: tuple[float, ...]  # their standard deviations
+    interval: tuple[tuple[float, float], ...]  # their 95 % intervals
 
     def __str__(self) -> str:
         """Return the fault in one line."""
-        sizes = ", ".join(f"{size:.4g} +- {spread:.2g}" for size, spread in zip(self.size, self.deviation))
+        ends = zip(self.size, self.interval)
+        sizes = ", ".join(f"{size:.4g} ({low:.4g} to {high:.4g})" for size, (low, high) in ends)
         return f"carried: {self.label}, size {sizes}"
