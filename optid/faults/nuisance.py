@@ -30,7 +30,7 @@ of the distance: where a reading is d half ranges from the middle of its range, 
 it is multiplied by d^2.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -220,7 +220,7 @@ def model_uncertainty(
     gained = replace(model, K=steady.K)
     own, parts = len(parameters(gained)[0]), in_units_of(model, data).experiments
     low, high = (limit([limit(part.y, axis=0) for part in parts], axis=0) for limit in (np.fmin.reduce, np.fmax.reduce))
-    curvature: Curvature | None = Curvature.of(parts)
+    curvature: Curvature | None = Curvature.of(list(parts))
     if curvature.coefficients(model.nx) > min(LARGEST, count // OFTEN - own):
         curvature = None
     gathered = _gathered(gained, steady, data, curvature)
@@ -335,7 +335,7 @@ def _operating_point(y: Array) -> Array:
     return np.convolve(np.append(0.0, along), np.full(SMOOTHED, 1 / SMOOTHED))[: len(along)]
 
 
-def overdispersion(grams: list[Array], correlations: list[Array]) -> float:
+def overdispersion(grams: Sequence[Array], correlations: Sequence[Array]) -> float:
     """Return the factor c of the covariance of parameters that vary between sections; 1 where they need not vary.
 
     Args:

@@ -74,7 +74,8 @@ def _known(head: dict[str, Any], arrays: dict[str, np.ndarray], functions: dict[
     """The model by which the last samples are judged."""
     model = from_content(head["model"], functions)
     parts: dict[str, Any] = {name: arrays[f"known_{name}"] for name in PREDICTOR}
-    curvature = None if head["curvature"] is None else Curvature(*map(np.array, head["curvature"]), model.m)
+    ends = head["curvature"]
+    curvature = None if ends is None else Curvature(np.array(ends[0]), np.array(ends[1]), model.m)
     return ModelUncertainty(model, Predictor(**parts, silent=int(head["silent"])), arrays["known_deviations"],
                             head["readings"], head["inflation"],
                             None if head["levels"] is None else np.array(head["levels"]), head["deviation"], curvature)

@@ -128,7 +128,8 @@ class Monitor:
         self.remark = " ".join(filter(None, remarks))
         if known is not None and isinstance(uncertainty, Data):
             effect, inputs = parameter_effect(known, uncertainty, found.predictor)
-        rules = {**RULES, **({"beyond": 1.0} if known is None else {}), **rules}  # an exact model has no errors
+        exact = {"beyond": 1.0, "wrong": 0.0} if known is None else {}  # an exact model has no errors
+        rules = {**RULES, **exact, **rules}
         self._set(found, int(window), seed, rules | ({} if found.unknown else {"odd": np.inf}),
                   sized, None if known is None else known.levels)
         for c in found.candidates:
@@ -171,7 +172,7 @@ class Monitor:
         self.decisions = Decisions(self.columns, self.labels, np.full(len(chosen), np.inf), np.ones(len(chosen)), rules,
                                    model.outputs, np.ones(len(chosen), dtype=bool), [], found.candidates)
         self.samples = 0
-        self.recent = None if known is None else Recent(known, window)
+        self.recent = self.decisions.recent = None if known is None else Recent(known, window)
         self._functions = tabulated(model.nonlinearities)
         self._input_of, self._output_of = (np.array(of, dtype=np.int64) for of in (model.input_of, model.output_of))
 
@@ -355,15 +356,15 @@ class Monitor:
 
     def _keep_sizes(self, due: float, events: list[Event]) -> None:
         """Keep sizes that are final at this sample, and discard samples with a fault that is over."""
-        recent, onsets = self.recent, self.decisions.onsets
+        recent, onsets = self.recent, {number: onset for number, onset in self.decisions.onsets}
         if recent is None:
             return
         if self.samples >= due:
             recent.final |= {number: one for number, one in self._estimates().items()
-                             if recent.last(dict(onsets)[number]) <= self.samples}
+                             if recent.last(onsets[number]) <= self.samples}
         if events and events[-1].kind == "cleared" and events[-1].candidates and events[-1].sample == self.samples - 1:
             recent.discard(self.samples)
-            recent.final = {number: one for number, one in recent.final.items() if number in dict(onsets)}
+            recent.final = {number: one for number, one in recent.final.items() if number in onsets}
 
     def _estimates(self) -> dict[int, Carried]:
         """Return {number of the candidate: the fault} of the carried faults that the last samples show."""

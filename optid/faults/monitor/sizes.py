@@ -77,40 +77,44 @@ class Recent:
             listed: the candidates of the dictionary.
             now: number of samples.
         """
+        labels = list(faults)
+        for found in self._explanations(faults, listed, now):
+            if [c.label for c in found.candidates] == labels:
+                count = len(found.search.whitened.r) if found.search is not None else 0
+                return {one.label: _carried(one) for one in estimates(found, COVERAGE, count, 2 * self.known.model.nx)}
+        return {}
+
+    def evidence(self, labels: Sequence[str], onset: int, listed: Sequence[Candidate], now: int) -> dict[str, float]:
+        """Return {label: logarithm of the likelihood} of what broke at an actuator since about an onset."""
+        families = dict.fromkeys(_family(one).label for one in listed if one.label in labels)
+        found = [one for label in families for one in self._explanations({label: onset}, listed, now)]
+        return {one.candidates[0].label: one.log_evidence for one in found if one.candidates[0].label in labels}
+
+    def _explanations(self, faults: dict[str, int], listed: Sequence[Candidate], now: int) -> list[Explanation]:
+        """Return the explanations of the samples before `now` by faults, in all kinds of broken actuators."""
         first = max(now - WINDOWS * self.window, self.first)
         u, y = (rows[first - self.first : now - self.first] for rows in (self.u, self.y))
         gaps = np.flatnonzero(np.isnan(u).any(axis=1))
         start = int(gaps[-1]) + 1 if gaps.size else 0
         model = self.known.model
         onsets = [max(onset - first - start, 0) for onset in faults.values()]
+        families = {label: family for one in listed for family in [_family(one)] for label in (one.label, family.label)}
+        chosen = [replace(families[label], into_state=families[label].into_state[: model.nx]) for label in faults]
         try:
             count, _ = usable_samples(model, u[start:])
-            if not faults or len(faults) > MOST or max(onsets) + 2 * model.nx + 2 > count:
-                return {}
+            if not chosen or len(chosen) > MOST or max(onsets) + model.nx + 2 > count:
+                return []
             part = Data(u[start : start + count], y[start : start + count], model.dt, model.inputs, model.outputs)
-            found = self._explanation(part, list(faults), onsets, listed)
+            white: Any = whiten(model, part, uncertainty=self.known)
         except DataError:
-            return {}
-        if found is None:
-            return {}
-        return {one.label: _carried(one) for one in estimates(found, COVERAGE, count, 2 * model.nx)}
-
-    def _explanation(self, part: Data, labels: list[str], onsets: list[int], listed: Sequence[Candidate]
-                     ) -> Explanation | None:
-        known = self.known
-        white: Any = whiten(known.model, part, uncertainty=known)
-        chosen = tuple(_family(next(c for c in listed if c.label == label), known.model.nx) for label in labels)
-        search = scan(Dictionary(known.model, known.predictor, chosen, {}, np.full((len(chosen),) * 2, np.nan)), white,
-                      part.u)
-        if len(chosen) == 1:
-            far = np.abs(np.arange(len(white.r)) - onsets[0]) > NEAR
-            search.statistic[:, far] = np.nan
-            found = single(search, chosen[0])
-            found = None if found is None else with_model_uncertainty(found, known)
-        else:
-            found = several(search, chosen, onsets, 1)
-        kinds = [] if found is None else split_by_kind(found, listed)
-        return next((one for one in kinds if [c.label for c in one.candidates] == labels), None)
+            return []
+        sines = np.full((len(chosen), len(chosen)), np.nan)
+        search = scan(Dictionary(model, self.known.predictor, tuple(chosen), {}, sines), white, part.u)
+        if len(chosen) > 1:
+            return split_by_kind(several(search, chosen, onsets, 1), listed)
+        search.statistic[:, np.abs(np.arange(count) - onsets[0]) > NEAR] = np.nan
+        found = single(search, chosen[0])
+        return [] if found is None else split_by_kind(with_model_uncertainty(found, self.known), listed)
 
 
 def _carried(one: Estimate) -> Carried:
@@ -119,11 +123,7 @@ def _carried(one: Estimate) -> Carried:
                    tuple((float(low), float(high)) for low, high in one.size_interval))
 
 
-def _family(candidate: Candidate, states: int) -> Candidate:
-    """Return a candidate of the model without the states that shape its noise; of a broken actuator the whole family.
-
-    A loss may add any constant, unless its zero is stated.
-    """
-    own = replace(candidate, into_state=candidate.into_state[:states])
-    is_family = own.kind == "loss" and own.columns and own.zero is None
-    return replace(own, kind="stuck", members=(f"{own.name} stuck",)) if is_family else own
+def _family(candidate: Candidate) -> Candidate:
+    """Return the whole family of a broken actuator, unless its zero is stated; other candidates unchanged."""
+    is_family = candidate.kind == "loss" and candidate.columns and candidate.zero is None
+    return replace(candidate, kind="stuck", members=(f"{candidate.name} stuck",)) if is_family else candidate
