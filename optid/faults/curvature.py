@@ -7,6 +7,7 @@ and the cubes of the inputs, are therefore further parameters, zero in the model
 gives the covariance, together with that of the others.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +32,7 @@ class Curvature:
     inputs: int
 
     @classmethod
-    def of(cls, parts: list[Experiment]) -> "Curvature":
+    def of(cls, parts: Sequence[Experiment]) -> "Curvature":
         """Return the products of the signals of some experiments."""
         both = np.vstack([np.hstack([part.u, part.y]) for part in parts])
         return cls(np.fmin.reduce(both), np.fmax.reduce(both), parts[0].u.shape[1])

@@ -220,7 +220,7 @@ def model_uncertainty(
     gained = replace(model, K=steady.K)
     own, parts = len(parameters(gained)[0]), in_units_of(model, data).experiments
     low, high = (limit([limit(part.y, axis=0) for part in parts], axis=0) for limit in (np.fmin.reduce, np.fmax.reduce))
-    curvature: Curvature | None = Curvature.of(list(parts))
+    curvature: Curvature | None = Curvature.of(parts)
     if curvature.coefficients(model.nx) > min(LARGEST, count // OFTEN - own):
         curvature = None
     gathered = _gathered(gained, steady, data, curvature)
