@@ -11,7 +11,7 @@ import optid
 from optid.bases import Linear, Polynomial
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.faults import Monitor, diagnose, dictionary, model_uncertainty, nuisance
-from optid.faults.curvature import Curvature
+from optid.faults.curvature import Products
 from optid.faults.monitor.readings import ReadingChecks
 from optid.faults.whitening import predictor
 from optid.models import Nonlinearity
@@ -73,6 +73,7 @@ def curved(count, seed, share=0.0, onset=0):
     return optid.Data(u, y, inputs=["valve"], outputs=["level"])
 
 
+@pytest.mark.filterwarnings("ignore:The plant is not of the class of the model")
 def test_the_curvature_of_a_plant_under_control_passes_less_for_that_of_its_valve(monkeypatch):
     """Diagnosis and monitor estimate by one formula; a plant of the class of the model has no products."""
     fit = optid.fit(curved(2500, 0), "hammerstein_ss.exact", nx=1, basis="polynomial:2", criterion="prediction",
@@ -105,7 +106,7 @@ def test_the_curvature_of_a_plant_under_control_passes_less_for_that_of_its_valv
 def test_products_act_as_a_plant_with_them_would():
     record = curved(200, 3)
     model = noisy(np.array([[0.8]]), np.array([[0.3]]), np.eye(1), 1e-4 * np.eye(1), 1e-4 * np.eye(1))
-    part, products = record.experiments[0], Curvature.of(record.experiments)
+    part, products = record.experiments[0], Products.of(record.experiments)
     steady = predictor(model)
     response = products.response(steady, part, np.ones(part.y.shape, dtype=bool))
     z = [2 * (signal - signal.min()) / np.ptp(signal) - 1 for signal in (part.u[:, 0], part.y[:, 0])]

@@ -19,7 +19,7 @@ from optid.faults.whitening import Predictor
 
 
 @dataclass(frozen=True, eq=False)
-class Curvature:
+class Products:
     """The products, of signals relative to their ranges in the record of identification.
 
     Attributes:
@@ -32,7 +32,7 @@ class Curvature:
     inputs: int
 
     @classmethod
-    def of(cls, parts: Sequence[Experiment]) -> "Curvature":
+    def of(cls, parts: Sequence[Experiment]) -> "Products":
         """Return the products of the signals of some experiments."""
         both = np.vstack([np.hstack([part.u, part.y]) for part in parts])
         return cls(np.fmin.reduce(both), np.fmax.reduce(both), parts[0].u.shape[1])

@@ -41,7 +41,7 @@ from optid.arrays import Array, as_list
 from optid.data.record import Data, Experiment
 from optid.data.stretches import interpolated
 from optid.errors import DataError
-from optid.faults.curvature import Curvature
+from optid.faults.curvature import Products
 from optid.faults.ranges import outside, unknown_effects
 from optid.faults.screening import check_causality
 from optid.faults.whitening import Nuisance, Predictor, predictor, whiten
@@ -112,7 +112,7 @@ class ModelUncertainty:
     inflation: float = 1.0
     levels: Array | None = None
     deviation: float = 0.0
-    curvature: Curvature | None = None
+    curvature: Products | None = None
 
     @cached_property
     def moves(self) -> "list[tuple[HammersteinSS, HammersteinSS, float]]":
@@ -220,7 +220,7 @@ def model_uncertainty(
     gained = replace(model, K=steady.K)
     own, parts = len(parameters(gained)[0]), in_units_of(model, data).experiments
     low, high = (limit([limit(part.y, axis=0) for part in parts], axis=0) for limit in (np.fmin.reduce, np.fmax.reduce))
-    curvature: Curvature | None = Curvature.of(parts)
+    curvature: Products | None = Products.of(parts)
     if curvature.coefficients(model.nx) > min(LARGEST, count // OFTEN - own):
         curvature = None
     gathered = _gathered(gained, steady, data, curvature)
@@ -265,7 +265,7 @@ class Estimated(NamedTuple):
     scale: float
 
 
-def _gathered(model: "HammersteinSS", steady: Predictor, data: Data, curvature: Curvature | None) -> Gathered:
+def _gathered(model: "HammersteinSS", steady: Predictor, data: Data, curvature: Products | None) -> Gathered:
     size = len(parameters(model)[0]) + (0 if curvature is None else curvature.coefficients(model.nx))
     information, readings, energy = np.zeros((size, size)), 0, 0.0
     sections: tuple[list[tuple[Array, Array]], ...] = [], []
@@ -438,7 +438,7 @@ def moved_models(
 
 def sensitivities(
     model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: Array, root: Array,
-    curvature: Curvature | None = None,
+    curvature: Products | None = None,
 ) -> tuple[Array, Array]:
     """Derivatives (N, l, q) and (N, l, n) of the innovations along the columns of root and by the start.
 

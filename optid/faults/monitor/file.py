@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from optid.errors import ModelFileError
-from optid.faults.curvature import Curvature
+from optid.faults.curvature import Products
 from optid.faults.monitor.arl import Calibration
 from optid.faults.monitor.columns import Window
 from optid.faults.monitor.decisions import Decisions
@@ -75,7 +75,7 @@ def _known(head: dict[str, Any], arrays: dict[str, np.ndarray], functions: dict[
     model = from_content(head["model"], functions)
     parts: dict[str, Any] = {name: arrays[f"known_{name}"] for name in PREDICTOR}
     ends = head["curvature"]
-    curvature = None if ends is None else Curvature(np.array(ends[0]), np.array(ends[1]), model.m)
+    curvature = None if ends is None else Products(np.array(ends[0]), np.array(ends[1]), model.m)
     return ModelUncertainty(model, Predictor(**parts, silent=int(head["silent"])), arrays["known_deviations"],
                             head["readings"], head["inflation"],
                             None if head["levels"] is None else np.array(head["levels"]), head["deviation"], curvature)

@@ -14,7 +14,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError
-from optid.faults.diagnosis.alternatives import split_by_kind
+from optid.faults.diagnosis.alternatives import family_of, split_by_kind
 from optid.faults.diagnosis.answers import Estimate
 from optid.faults.diagnosis.counting import with_model_uncertainty
 from optid.faults.diagnosis.posterior import Explanation, estimates, several, single
@@ -86,7 +86,7 @@ class Recent:
 
     def evidence(self, labels: Sequence[str], onset: int, listed: Sequence[Candidate], now: int) -> dict[str, float]:
         """Return {label: logarithm of the likelihood} of what broke at an actuator since about an onset."""
-        families = dict.fromkeys(_family(one).label for one in listed if one.label in labels)
+        families = dict.fromkeys(family_of(one).label for one in listed if one.label in labels)
         found = [one for label in families for one in self._explanations({label: onset}, listed, now)]
         return {one.candidates[0].label: one.log_evidence for one in found if one.candidates[0].label in labels}
 
@@ -98,7 +98,7 @@ class Recent:
         start = int(gaps[-1]) + 1 if gaps.size else 0
         model = self.known.model
         onsets = [max(onset - first - start, 0) for onset in faults.values()]
-        families = {label: family for one in listed for family in [_family(one)] for label in (one.label, family.label)}
+        families = {label: family_of(one) for one in listed for label in (one.label, family_of(one).label)}
         chosen = [replace(families[label], into_state=families[label].into_state[: model.nx]) for label in faults]
         try:
             count, _ = usable_samples(model, u[start:])
@@ -121,9 +121,3 @@ def _carried(one: Estimate) -> Carried:
     size = np.where(np.isnan(one.size), one.size_interval.mean(axis=1), one.size)
     return Carried(one.label, tuple(size.tolist()), tuple(np.sqrt(np.diag(one.covariance)).tolist()),
                    tuple((float(low), float(high)) for low, high in one.size_interval))
-
-
-def _family(candidate: Candidate) -> Candidate:
-    """Return the whole family of a broken actuator, unless its zero is stated; other candidates unchanged."""
-    is_family = candidate.kind == "loss" and candidate.columns and candidate.zero is None
-    return replace(candidate, kind="stuck", members=(f"{candidate.name} stuck",)) if is_family else candidate
