@@ -31,6 +31,11 @@ class Event:
     statistic: float = 0.0
     note: str = ""
 
+    @property
+    def ends_fault(self) -> bool:
+        """Whether a fault that was named is over."""
+        return self.kind == "cleared" and bool(self.candidates)
+
     def __str__(self) -> str:
         """Return the event in one line."""
         return self.in_words()

@@ -362,7 +362,7 @@ class Monitor:
         if self.samples >= due:
             recent.final |= {number: one for number, one in self._estimates().items()
                              if recent.last(onsets[number]) <= self.samples}
-        if events and events[-1].kind == "cleared" and events[-1].candidates and events[-1].sample == self.samples - 1:
+        if events and events[-1].ends_fault and events[-1].sample == self.samples - 1:
             recent.discard(self.samples)
             recent.final = {number: one for number, one in recent.final.items() if number in onsets}
 
