@@ -1,5 +1,6 @@
 """Faults of a plant under control: what is identified, named, sized and promised there."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,10 @@ from fault_plants import noisy, refused
 import optid
 from optid.bases import Linear, Polynomial
 from optid.errors import DataError, DataWarning, RankError, StructureError
-from optid.faults import Monitor, dictionary, model_uncertainty
+from optid.faults import Monitor, diagnose, dictionary, model_uncertainty, nuisance
+from optid.faults.curvature import Products
+from optid.faults.monitor.readings import ReadingChecks
+from optid.faults.whitening import predictor
 from optid.models import Nonlinearity
 
 
@@ -53,6 +57,74 @@ def test_a_regulated_plant_is_fitted_without_feedthrough_and_the_advice_is_taken
     y[700:, 0] += 0.6
     alarms = [e for e in monitor.run(later.u, y) if e.kind == "alarm"]
     assert alarms and alarms[0].sample >= 700
+
+
+def curved(count, seed, share=0.0, onset=0):
+    """A level under PI control behind an exponential valve; what flows in falls with the level."""
+    rng = np.random.default_rng(seed)
+    x, total, u, y = 1.0, 0.0, np.empty((count, 1)), np.empty((count, 1))
+    targets = np.repeat(rng.uniform(0.7, 1.3, -(-count // 20)), 20)
+    for k in range(count):
+        y[k] = x + 0.001 * rng.standard_normal()
+        total += 0.04 * (targets[k] - y[k, 0])
+        u[k] = 0.3 * (targets[k] - y[k, 0]) + total
+        flow = 0.1 * np.exp(u[k, 0]) * (1 - share * (k >= onset))
+        x += flow * (2.5 - x) - 0.15 * x + 0.001 * rng.standard_normal()
+    return optid.Data(u, y, inputs=["valve"], outputs=["level"])
+
+
+@pytest.mark.filterwarnings("ignore:The plant is not of the class of the model")
+def test_the_curvature_of_a_plant_under_control_passes_less_for_that_of_its_valve(monkeypatch):
+    """Diagnosis and monitor estimate by one formula; a plant of the class of the model has no products."""
+    fit = optid.fit(curved(2500, 0), "hammerstein_ss.exact", nx=1, basis="polynomial:2", criterion="prediction",
+                    feedthrough=False, prove=False)
+    known = model_uncertainty(fit.model, fit.data)
+    monkeypatch.setattr(nuisance, "LARGEST", 0)
+    flat = model_uncertainty(fit.model, fit.data)
+    assert known.curvature is not None and "products" in known.remark and flat.curvature is None
+    found = dictionary(fit.model, kinds=["bias", "loss"], state_jump=False)
+    built = Monitor(fit.model, found, window=60, thresholds=np.full(3, 25.0), uncertainty=known)
+    sizes, compared = [], 0
+    for seed in range(2, 5):
+        record, monitor = curved(300, seed, 0.15, 120), copy.deepcopy(built)
+        ends = []
+        for one in (known, flat):
+            answer = diagnose(fit.model, record, found, model_uncertainty=one)
+            ends += [e for a in answer.candidates for e in a.faults if e.label == "actuator:valve loss"]
+        sizes.append([e.size[0] for e in ends])
+        monitor.run(record.u, record.y)
+        for carried in monitor.carried:
+            if carried.label == "actuator:valve loss":
+                assert np.allclose(carried.interval, ends[0].size_interval, atol=1e-9)
+                compared += 1
+    better, worse = 0.15 - np.mean(sizes, axis=0)
+    assert compared and 0 < better < 0.6 * worse
+    model, u, y = controlled(count=1500)
+    assert model_uncertainty(model, optid.Data(u, y)).curvature is None
+
+
+def test_products_act_as_a_plant_with_them_would():
+    record = curved(200, 3)
+    model = noisy(np.array([[0.8]]), np.array([[0.3]]), np.eye(1), 1e-4 * np.eye(1), 1e-4 * np.eye(1))
+    part, products = record.experiments[0], Products.of(record.experiments)
+    steady = predictor(model)
+    response = products.response(steady, part, np.ones(part.y.shape, dtype=bool))
+    z = [2 * (signal - signal.min()) / np.ptp(signal) - 1 for signal in (part.u[:, 0], part.y[:, 0])]
+    for number, signal in enumerate((z[0] ** 3, z[0] * z[1], z[1] ** 2)):
+        x, expected = 0.0, []
+        for k in range(len(signal)):
+            expected.append(x)
+            x = steady.F[0, 0] * x + signal[k]
+        assert np.allclose(response[:, 0, number], expected)
+
+
+def test_an_excursion_is_remembered_however_many_follow_in_its_block():
+    model, _, _ = controlled(count=10)
+    checks = ReadingChecks(model, 500, np.array([[-1.0, -1.0], [1.0, 1.0]]))
+    y = np.zeros((900, 2))
+    y[::3, 0] = 2.0
+    checks.screen(np.zeros((900, 2)), y, 0)
+    assert checks.excursion(1, 20) == (f"output:{model.outputs[0]}", 3)
 
 
 A, B, C = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.5, 0.1], [0.2, 0.6]]), np.eye(2)

@@ -1,6 +1,7 @@
-"""What monitor and diagnosis do on the strange plants: false alarms, names, kinds, intervals, sets.
+"""What monitor and diagnosis do with a model from a subspace fit: false alarms, names, kinds, intervals, sets.
 
-Every run identifies a model of its own from 3,000 healthy samples of `strange_plants.py`.
+Every run identifies a model of its own from 3,000 healthy samples of the tanks, the motor and the heater of
+`physical_plants.py`.
 
     python benchmarks/faults/strange_figures.py FIGURE... [--runs 4] [--first 0] [--plant tanks motor heater]
 
@@ -26,7 +27,8 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from strange_plants import FAILURES, Failure, identify, record, simulate
+from physical_plants import START, Failure, identified, record
+from physical_plants import simulate as simulate_many
 
 from optid.errors import DataError
 from optid.faults import Monitor, diagnose, dictionary
@@ -36,10 +38,31 @@ KINDS = "bias", "loss", "stuck", "drift", "frozen", "noise", "spike"
 WATCHED = "bias", "loss", "stuck", "drift"
 HALF = {"tanks": "h1", "motor": "w", "heater": "T"}
 
+FAILURES: dict[str, tuple[Failure, ...]] = {
+    "tanks": (Failure("actuator:v1", "loss", 0, 0.5), Failure("actuator:v2", "stuck", 0, 0.8),
+              Failure("sensor:h1", "bias", 0, 12.0), Failure("sensor:h2", "drift", 0, 0.2),
+              Failure("sensor:h1", "frozen", 0), Failure("sensor:h2", "dead", 0), Failure("sensor:h1", "gain", 0, 0.5),
+              Failure("sensor:h2", "noise", 0, 4.0), Failure("process:leak", "leak", 0, 4.0)),
+    "motor": (Failure("actuator:u", "loss", 0, 0.4), Failure("actuator:u", "stuck", 0, 2.0),
+              Failure("sensor:i", "bias", 0, 10.0), Failure("sensor:w", "drift", 0, 0.07),
+              Failure("sensor:w", "frozen", 0), Failure("sensor:i", "dead", 0), Failure("sensor:w", "gain", 0, 0.5),
+              Failure("sensor:i", "noise", 0, 4.0), Failure("process:leak", "leak", 0, 0.02)),
+    "heater": (Failure("actuator:v", "loss", 0, 0.4), Failure("actuator:v", "stuck", 0, 5.0),
+               Failure("sensor:T", "bias", 0, 12.0), Failure("sensor:T", "drift", 0, 0.25),
+               Failure("sensor:T", "frozen", 0), Failure("sensor:T", "dead", 0), Failure("sensor:T", "gain", 0, 0.5),
+               Failure("sensor:T", "noise", 0, 4.0), Failure("process:leak", "leak", 0, 4.0)),
+}
+"""Faults of each plant; the onset is set by the run."""
+
 
 @cache
 def fitted(plant: str, run: int) -> Any:
-    return identify(plant, run)
+    return identified(plant, run, 3000 + START)
+
+
+def simulate(plant: str, samples: int, seed: int, failure: Failure | None = None, **how: float) -> Any:
+    u, y = simulate_many(plant, samples, seed, [failure], **how)
+    return u[0], y[0]
 
 
 @cache

@@ -30,10 +30,10 @@ of the distance: where a reading is d half ranges from the middle of its range, 
 it is multiplied by d^2.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,7 @@ from optid.arrays import Array, as_list
 from optid.data.record import Data, Experiment
 from optid.data.stretches import interpolated
 from optid.errors import DataError
+from optid.faults.curvature import Products
 from optid.faults.ranges import outside, unknown_effects
 from optid.faults.screening import check_causality
 from optid.faults.whitening import Nuisance, Predictor, predictor, whiten
@@ -73,6 +74,9 @@ SMOOTHED = 5
 REJECTED = 3.0
 """Standard deviations of the score at which equal parameters of all sections are rejected."""
 
+LARGEST, OFTEN = 100, 10
+"""Largest number of coefficients of products, and fewest samples for each parameter with them."""
+
 ITERATIONS = 30
 """Iterations of the estimate of their variation."""
 
@@ -98,6 +102,7 @@ class ModelUncertainty:
         inflation: factor of the covariance, from a healthy record or from the sections of the identification.
         levels: (2, l) lowest and highest readings of the identification; None for a model that is exact.
         deviation: of the parameters from the most likely ones, in standard deviations; 0 where it is not significant.
+        curvature: the products whose coefficients are the last parameters; None where they are zero.
     """
 
     model: "HammersteinSS"
@@ -107,6 +112,7 @@ class ModelUncertainty:
     inflation: float = 1.0
     levels: Array | None = None
     deviation: float = 0.0
+    curvature: Products | None = None
 
     @cached_property
     def moves(self) -> "list[tuple[HammersteinSS, HammersteinSS, float]]":
@@ -118,6 +124,9 @@ class ModelUncertainty:
         """Advice where the parameters are not the most likely ones; empty otherwise."""
         if not self.deviation:
             return ""
+        if self.curvature is not None:
+            return (f"The plant is not of the class of the model ({self.deviation:.0f} standard deviations): products "
+                    "of its inputs and outputs count as uncertain parameters.")
         return (f"The parameters are {self.deviation:.0f} standard deviations from the most likely ones, so that small "
                 "faults stay hidden: fit the model by its prediction errors (hammerstein_ss.exact or ss.exact with "
                 "criterion=prediction, behind a controller with feedthrough=false).")
@@ -146,6 +155,10 @@ class ModelUncertainty:
                              f"samples, first in sample {samples[0]}: the model is less certain there.")
         return notes
 
+    def sensitivities(self, part: Experiment, x0: Array, present: Array) -> tuple[Array, Array]:
+        """Derivatives (N, l, q) and (N, l, n) of the innovations along the columns of root and by the start."""
+        return sensitivities(self.model, self.predictor, part, x0, present, self.root, self.curvature)
+
     def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True,
                  seen: Callable[[Array], Array] | None = None) -> Nuisance:
         """Return the effect of the uncertainty on the whitened innovations of a record.
@@ -162,7 +175,7 @@ class ModelUncertainty:
             sizes = np.linalg.norm(self.predictor.flattened(changes, present), axis=0)
             return DIFFUSE * changes[:, :, sizes > 0] / sizes[sizes > 0]
 
-        by_parameter, by_start = sensitivities(self.model, self.predictor, part, x0, present, self.root)
+        by_parameter, by_start = self.sensitivities(part, x0, present)
         columns: list[Any] = [self.distance(part.y)[:, :, None] ** 2 * by_parameter]
         if free_start:
             columns.append(diffuse(by_start))
@@ -205,14 +218,61 @@ def model_uncertainty(
         steady = predictor(model if noise is None else replace(
             model, noise=replace(noise, R=noise.R + model.nx / count * noise.innovation)))
     gained = replace(model, K=steady.K)
-    size = len(parameters(gained)[0])
+    own, parts = len(parameters(gained)[0]), in_units_of(model, data).experiments
+    low, high = (limit([limit(part.y, axis=0) for part in parts], axis=0) for limit in (np.fmin.reduce, np.fmax.reduce))
+    curvature: Products | None = Products.of(parts)
+    if curvature.coefficients(model.nx) > min(LARGEST, count // OFTEN - own):
+        curvature = None
+    gathered = _gathered(gained, steady, data, curvature)
+    found = _estimated(gathered, own)
+    if curvature is not None and not found.deviation:
+        wider = _estimated(gathered, len(gathered.information))
+        found, curvature = (wider, curvature) if wider.deviation else (found, None)
+    steady = replace(steady, covariance=found.scale**2 * steady.covariance, root=steady.root / found.scale)
+    factor = 1.0 if healthy is not None else found.factor
+    root = np.sqrt(factor) * found.root
+    if found.deviation:
+        root = np.column_stack([root, found.moved])
+    result = ModelUncertainty(gained, steady, root, gathered.readings, factor, np.array([low, high]), found.deviation,
+                              curvature if len(root) > own else None)
+    return result if healthy is None else _inflated(result, healthy)
+
+
+class Gathered(NamedTuple):
+    """What a record says about parameters.
+
+    Attributes:
+        information: (p, p).
+        readings: less those that initial states and decoupled disturbances take.
+        energy: of the whitened innovations.
+        sections: products (p, p) of the sensitivities, and (p,) with the innovations, of sections in the order of time
+            and in that of the operating point.
+    """
+
+    information: Array
+    readings: int
+    energy: float
+    sections: tuple[list[tuple[Array, Array]], list[tuple[Array, Array]]]
+
+
+class Estimated(NamedTuple):
+    """Root (p, q) of a covariance for one section, the factor of it, the deviation (p,) and its size, and the scale."""
+
+    root: Array
+    factor: float
+    moved: Array
+    deviation: float
+    scale: float
+
+
+def _gathered(model: "HammersteinSS", steady: Predictor, data: Data, curvature: Products | None) -> Gathered:
+    size = len(parameters(model)[0]) + (0 if curvature is None else curvature.coefficients(model.nx))
     information, readings, energy = np.zeros((size, size)), 0, 0.0
     sections: tuple[list[tuple[Array, Array]], ...] = [], []
-    levels = np.full((2, model.l), np.nan)
-    length = max(count // SECTIONS, 1)
-    for part, x0, present, white in _whitened_parts(gained, steady, data):
+    length = max(sum(len(part.y) for part in data.experiments) // SECTIONS, 1)
+    for part, x0, present, white in _whitened_parts(model, steady, data):
         by_parameter, by_start = (steady.flattened(effect, present) for effect in
-                                  sensitivities(gained, steady, part, x0, present, np.eye(size)))
+                                  sensitivities(model, steady, part, x0, present, np.eye(size), curvature))
         basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
         basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
         rest = by_parameter - basis @ (basis.T @ by_parameter)
@@ -220,7 +280,6 @@ def model_uncertainty(
         readings += int(present.sum()) - basis.shape[1] - steady.silent * int(present.all(axis=1).sum())
         left = white - basis @ (basis.T @ white)
         energy += float(np.sum(left**2))
-        levels = np.array([np.fmin(levels[0], np.fmin.reduce(part.y)), np.fmax(levels[1], np.fmax.reduce(part.y))])
         # after a missing reading innovations are larger until the predictor has settled
         sample = np.arange(len(present))
         gap = np.maximum.accumulate(np.where(present.all(axis=1), -steady.settling - 1, sample))
@@ -231,6 +290,16 @@ def model_uncertainty(
             edges = np.linspace(0, len(rest), count_here + 1).astype(int)
             sections[which].extend((rest[own].T @ rest[own], rest[own].T @ left[own])
                                    for own in (rows[a:b] for a, b in zip(edges, edges[1:])))
+    return Gathered(information, readings, energy, sections)
+
+
+def _estimated(gathered: Gathered, size: int) -> Estimated:
+    """Return the covariance of the first parameters, the others being zero.
+
+    Raises:
+        DataError: fewer than two readings for each direction of the parameters that changes the predictions.
+    """
+    information, readings = gathered.information[:size, :size], gathered.readings
     sizes = np.sqrt(np.diag(information))
     sizes[sizes == 0] = 1.0
     values, axes = np.linalg.eigh(information / np.outer(sizes, sizes))
@@ -240,24 +309,18 @@ def model_uncertainty(
             f"{readings} readings (beside the initial states) do not determine the parameters well enough for a "
             f"covariance of the model: {int(known.sum())} directions change its predictions. Use a longer record."
         )
-    scale = np.sqrt(energy / (readings - int(known.sum())))
-    root = scale * axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
-    steady = replace(steady, covariance=scale**2 * steady.covariance, root=steady.root / scale)
-    unit = root / scale
-    grams = [[unit.T @ gram @ unit for gram, _ in one] for one in sections]
-    scores = [[unit.T @ along / scale for _, along in one] for one in sections]
+    scale = float(np.sqrt(gathered.energy / (readings - int(known.sum()))))
+    unit = axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
+    grams = [[unit.T @ gram[:size, :size] @ unit for gram, _ in one] for one in gathered.sections]
+    scores = [[unit.T @ along[:size] / scale for _, along in one] for one in gathered.sections]
     score = np.sum(scores[0], axis=0)
     moved = np.linalg.pinv(np.sum(grams[0], axis=0), rcond=KNOWN, hermitian=True) @ score
     deviation = float(np.sqrt(max(score @ moved, 0.0)))
     if deviation**2 <= len(score) + REJECTED * np.sqrt(2 * len(score)):
         deviation, moved = 0.0, 0 * moved
-    factor = 1.0
-    if healthy is None:
-        factor = max(overdispersion(gram, [one - part @ moved for one, part in zip(along, gram)])
-                     for along, gram in zip(scores, grams))
-    both = np.column_stack([np.sqrt(factor) * root, root @ moved]) if deviation else np.sqrt(factor) * root
-    found = ModelUncertainty(gained, steady, both, readings, factor, levels, deviation)
-    return found if healthy is None else _inflated(found, healthy)
+    factor = max(overdispersion(gram, [one - part @ moved for one, part in zip(along, gram)])
+                 for along, gram in zip(scores, grams))
+    return Estimated(scale * unit, factor, scale * unit @ moved, deviation, scale)
 
 
 def _operating_point(y: Array) -> Array:
@@ -272,7 +335,7 @@ def _operating_point(y: Array) -> Array:
     return np.convolve(np.append(0.0, along), np.full(SMOOTHED, 1 / SMOOTHED))[: len(along)]
 
 
-def overdispersion(grams: list[Array], correlations: list[Array]) -> float:
+def overdispersion(grams: Sequence[Array], correlations: Sequence[Array]) -> float:
     """Return the factor c of the covariance of parameters that vary between sections; 1 where they need not vary.
 
     Args:
@@ -366,6 +429,7 @@ def moved_models(
 ) -> "Iterator[tuple[HammersteinSS, HammersteinSS, float]]":
     """Yield two models on both sides along every column of root, and the factor of their difference."""
     theta, steps, back = parameters(model)
+    root = root[: len(theta)]  # those of the model
     largest = np.abs(root / steps[:, None]).max(axis=0, initial=0.0)
     largest[largest == 0] = 1.0
     for column, size in zip(root.T, largest):  # no parameter moves by more than its step
@@ -373,9 +437,13 @@ def moved_models(
 
 
 def sensitivities(
-    model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: Array, root: Array
+    model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: Array, root: Array,
+    curvature: Products | None = None,
 ) -> tuple[Array, Array]:
-    """Derivatives (N, l, q) and (N, l, n) of the innovations along the columns of root and by the start."""
+    """Derivatives (N, l, q) and (N, l, n) of the innovations along the columns of root and by the start.
+
+    The last rows of root are those of the products, where there are any.
+    """
     columns = np.empty((*present.shape, root.shape[1]))
     for j, (plus, minus, factor) in enumerate(moved_models(model, root)):
         first, second = (
@@ -383,4 +451,7 @@ def sensitivities(
             for moved in (plus, minus)
         )
         columns[:, :, j] = np.where(present, (second - first) * factor, 0.0)
+    if curvature is not None:
+        more = root[len(root) - curvature.coefficients(model.nx) :]
+        columns -= np.where(present[:, :, None], curvature.response(steady, part, present) @ more, 0.0)
     return columns, steady.jumps(0, present)

@@ -181,7 +181,10 @@ class Nuisance:
 class UncertainInnovations(Protocol):
     """What whitening asks of the uncertainty of an identified model: a predictor, and its effect on a window."""
 
-    predictor: Predictor
+    @property
+    def predictor(self) -> Predictor:
+        """The predictor of its noise."""
+        ...
 
     def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
         """Return the effect on the innovations of an experiment with readings (N, l) from a state (n,)."""

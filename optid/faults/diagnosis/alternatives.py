@@ -47,14 +47,21 @@ def with_unlisted_candidates(found: Dictionary) -> Dictionary | None:
     possible answer, the disturbance of unknown direction.
     """
     wide = {c.name for c in found.candidates if c.has_constants}
-    more = [c.widened for c in found.candidates
-            if c.fault_kind.loses and c.columns and c.zero is None and c.name not in wide]
+    more = [family_of(c) for c in found.candidates if family_of(c) is not c and c.name not in wide]
     known = found.model.l > 1 or any(not c.fault_kind.waveform for c in found.candidates)
     if found.unknown and known and all(c.name != UNKNOWN_DIRECTION for c in found.candidates):
         listed = {} if declares_process(found) else {c.kind: None for c in found.candidates if c.fault_kind.leaks}
         more += [candidate_of(found.model, UNKNOWN_DIRECTION, kind) for kind in dict.fromkeys([LEAK, *listed])]
     sines = np.full((len(more), len(more)), np.nan)
     return replace(found, candidates=tuple(more), excluded={}, sines=sines) if more else None
+
+
+def family_of(candidate: Candidate) -> Candidate:
+    """Return an actuator with a loss of unstated zero as one to which any constant is added; others unchanged."""
+    if not (candidate.fault_kind.loses and candidate.columns) or candidate.zero is not None or candidate.has_constants:
+        return candidate
+    family = candidate.widened
+    return replace(family, members=(family.own_label,))
 
 
 def declares_process(found: Dictionary) -> bool:

@@ -14,12 +14,13 @@ from optid.faults.monitor.columns import Columns, Window
 from optid.faults.monitor.events import Event
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT
+from optid.faults.monitor.sizes import Recent
 from optid.faults.nuisance import CONFIDENCE
 from optid.faults.signatures import Candidate
 
 RULES = {
     "certainty": 0.98, "release": 0.5, "patience": 40.0, "settle": 10.0, "still": 10.0, "faded": 1e-8, "learned": 0.02,
-    "forgiven": 0.3, "odd": 4.3, "beyond": 2.0, "adapt": 1.0,
+    "forgiven": 0.3, "odd": 4.3, "wrong": 0.02, "beyond": 2.0, "adapt": 1.0,
 }
 """Numbers of the decisions.
 
@@ -28,7 +29,7 @@ samples with all statistics below `release` of their thresholds. An isolated fau
 A transient ends when its energy falls to `faded`. The size of a carried fault is no longer estimated once its standard
 error, propagated over a window, has an energy below `learned`; the fault is cleared when its significance falls below
 the share `forgiven` of the threshold. No candidate explains an alarm when the residual energy is `odd` standard
-deviations too large.
+deviations too large; the signature of an uncertain model leaves a share `wrong` of the energy that it explains.
 
 Where more windows than a tenth reach the energies that a tenth of the simulated ones reach, the noise has another
 colour than that of the calibration: the thresholds are then multiplied by the ratio of these energies, by `adapt` at
@@ -51,6 +52,9 @@ plant is where the model was not identified, and the model does not describe it 
 
 Excursion = Callable[[int, int], tuple[str, int] | None]
 """(since, before) -> channel that was far outside its range after `since`, and when it left it, `before` a sample."""
+
+AGAIN_AT = 1.25
+"""Growth of the samples since an onset after which the kind of a carried actuator is judged again."""
 
 NOTHING, AGAIN = -1, -2
 """No candidate is isolated; no candidate has explained the alarm before."""
@@ -80,6 +84,7 @@ class Decisions:
     # [candidate, labels] of carried actuators whose kind is not decided yet
     undecided: list[list[Any]] = field(default_factory=list)
     told: list[str] = field(default_factory=list)  # labels of the last isolated fault
+    onsets: list[list[int]] = field(default_factory=list)  # [candidate, first sample] of the carried faults
     kept: list[Array] | None = None  # the statistics (T, C) of all samples, where they are requested
 
     common: float = float("nan")  # energy over its threshold that a tenth of the simulated windows reach
@@ -87,8 +92,10 @@ class Decisions:
     windows: list[float] = field(default_factory=list)  # those of the last windows
     adapted: float = 1.0  # factor of the thresholds for the colour of the noise
 
+    recent: Recent | None = None  # the last samples
+
     KEPT = ("phase", "alarm", "named", "named_at", "quiet", "begun", "raised", "passing", "undecided", "told",
-            "highest", "windows", "adapted")
+            "onsets", "highest", "windows", "adapted")
 
     @cached_property
     def groups(self) -> tuple[int, ...]:
@@ -192,7 +199,7 @@ class Decisions:
         if hold:
             return None
         event = self._name(now, best, gains, window, plant)
-        if self.phase == LOST and (left := excursion(self.alarm - window.length, now + 1)):
+        if self.phase == LOST and (left := excursion(self.alarm - window.length, self.alarm + 1)):
             return self._distrust(now, left)  # what no fault explains is an error of the model
         return event
 
@@ -209,7 +216,7 @@ class Decisions:
     def _name(self, now: int, best: int, gains: Array, window: Window, plant: RunningFilter) -> Event | None:
         rule, noise = self.rules, self._noisy_sensor(now, window)
         # increased noise is an answer, too, and the likely one where no candidate explained the alarm before
-        louder = (0.0 if noise is None else noise.statistic) - float(self.thresholds.min()) * (self.named != AGAIN)
+        louder = (0.0 if noise is None else noise.statistic) - float(self.thresholds.max()) * (self.named != AGAIN)
         rivals = [gains[self.group(c)].max() for c in sorted(set(self.groups))]
         share = np.exp(np.clip(np.append(rivals, louder) - gains[best], -700, 700) / 2)
         sure = 1 / share.sum() >= rule["certainty"]
@@ -249,7 +256,8 @@ class Decisions:
 
     def _carry(self, now: int, chosen: int, window: Window, plant: RunningFilter) -> Event | None:
         """Compensate a fault from now on, an actuator of undecided kind with share and constants."""
-        weights, event = self._kinds(chosen, window), None
+        onset = now - int(window.peak[chosen]) + 1
+        weights, event = self._judged(chosen, onset, now) or self._kinds(chosen, window), None
         said = likeliest(weights)
         labels = [label for label, _ in said]
         if labels != [label for label in self.told if label in weights]:
@@ -258,12 +266,23 @@ class Decisions:
         if family and (len(labels) > 1 or not self.columns.candidates[chosen].additive):
             chosen = family[0]
             self.undecided = [one for one in self.undecided if one[0] != chosen] + [[chosen, labels]]
+        self.onsets = [one for one in self.onsets if one[0] != chosen] + [[chosen, onset]]
         plant.room(2 * int(self.columns.size.max()))
         left = plant.carry(chosen, window)
         if np.isfinite(left):
             self.passing.append([chosen, now + _fading(plant, left, self.rules["faded"])])
         self.forgive(window)
         return event
+
+    def _judged(self, number: int, onset: int, now: int) -> dict[str, float]:
+        """Return {label: likelihood} of the group of a candidate by a diagnosis of the last samples; empty without."""
+        name, beside = self.columns.candidates[number].name, [one for one in self.onsets if one[0] != number]
+        if self.recent is None or beside or not name.startswith("actuator:"):
+            return {}
+        labels = [c.label for c in self.listed if c.name == name and is_grouped(c)]
+        logs = self.recent.evidence(labels, onset, self.listed, now + 1)
+        most = max(logs.values(), default=0.0)
+        return {label: float(np.exp(log - most)) for label, log in logs.items()}
 
     def _kinds(self, number: int, window: Window) -> dict[str, float]:
         """Return {label: likelihood} of the group of a candidate."""
@@ -302,7 +321,7 @@ class Decisions:
         window.restart()
         if said:
             return None
-        if noise is not None and noise.statistic > self.thresholds.min():
+        if noise is not None and noise.statistic > self.thresholds.max():
             return noise
         return Event("isolated", now, (("unknown", 1.0),), onset, (), energy, "no candidate explains it")
 
@@ -314,7 +333,8 @@ class Decisions:
         free -= float(self.columns.size[number])
         if free < 1:
             return 0.0, free
-        return float(excess(max(energy - float(window.statistic[number]), 0.0), free)), free
+        explained = (1 + self.rules["wrong"]) * float(window.statistic[number])
+        return float(excess(max(energy - explained, 0.0), free)), free
 
     def _event(self, kind: str, now: int, best: int, gains: Array, window: Window) -> Event:
         weights: dict[str, float] = {}
@@ -348,6 +368,7 @@ class Decisions:
         for number, (owner, until) in enumerate(self.passing):
             if now >= until:
                 del self.passing[number]
+                self.onsets = [one for one in self.onsets if one[0] != owner]
                 return Event("cleared", now, ((self.labels[owner], 1.0),))
         n = plant.model.nx
         for owner in dict.fromkeys(one.owner for one in plant.directions):
@@ -362,7 +383,8 @@ class Decisions:
             energy = float(sizes @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ sizes)
             if energy < self.rules["forgiven"] * self.q[owner]:
                 plant.release(rows, own, window)
-                self.undecided = [one for one in self.undecided if one[0] != owner]
+                self.undecided, self.onsets = ([one for one in kept if one[0] != owner]
+                                               for kept in (self.undecided, self.onsets))
                 return Event("cleared", now, ((self.labels[owner], 1.0),))
             if event := self._revise(now, owner, sizes, covariance):
                 return event
@@ -378,14 +400,27 @@ class Decisions:
         for one in self.undecided:
             if one[0] != owner:
                 continue
-            logs = self._evidence(owner, sizes, covariance)
-            most = max(logs.values())
-            said = likeliest({label: float(np.exp(log - most)) for label, log in logs.items()})
+            weights = self._weights(now, owner, sizes, covariance)
+            if not weights:
+                continue
+            said = likeliest(weights)
             labels = [label for label, _ in said]
             if set(labels) < set(one[1]) or (said[0][1] >= self.rules["certainty"] and labels != one[1]):
                 one[1] = labels
                 return Event("revised", now, said, size=self.columns.in_order(owner, sizes))
         return None
+
+    def _weights(self, now: int, owner: int, sizes: Array, covariance: Array) -> dict[str, float]:
+        """Return {label: likelihood} of a carried actuator; empty where nothing new is to be expected yet."""
+        if self.recent is not None and len(self.onsets) == 1:
+            age = max(now - self.onsets[0][1], 1)
+            if int(np.log(age + 1) / np.log(AGAIN_AT)) == int(np.log(age) / np.log(AGAIN_AT)):
+                return {}
+            if age < self.recent.last(0):
+                return self._judged(owner, self.onsets[0][1], now)
+        logs = self._evidence(owner, sizes, covariance)
+        most = max(logs.values())
+        return {label: float(np.exp(log - most)) for label, log in logs.items()}
 
     def _noisy_sensor(self, now: int, window: Window) -> Event | None:
         """The sensor whose noise has most likely increased; the statistic is twice the log-likelihood gained.

@@ -31,6 +31,11 @@ class Event:
     statistic: float = 0.0
     note: str = ""
 
+    @property
+    def ends_fault(self) -> bool:
+        """Whether a fault that was named is over."""
+        return self.kind == "cleared" and bool(self.candidates)
+
     def __str__(self) -> str:
         """Return the event in one line."""
         return self.in_words()
@@ -59,10 +64,12 @@ class Carried:
     """An isolated fault whose effect is compensated."""
 
     label: str  # the candidate
-    size: tuple[float, ...]  # its magnitudes
+    size: tuple[float, ...]  # its magnitudes, as in `Dictionary.signature`
     deviation: tuple[float, ...]  # their standard deviations
+    interval: tuple[tuple[float, float], ...]  # their 95 % intervals
 
     def __str__(self) -> str:
         """Return the fault in one line."""
-        sizes = ", ".join(f"{size:.4g} +- {spread:.2g}" for size, spread in zip(self.size, self.deviation))
+        ends = zip(self.size, self.interval)
+        sizes = ", ".join(f"{size:.4g} ({low:.4g} to {high:.4g})" for size, (low, high) in ends)
         return f"carried: {self.label}, size {sizes}"

@@ -6,20 +6,25 @@ from typing import Any
 import numpy as np
 
 from optid.errors import ModelFileError
+from optid.faults.curvature import Products
 from optid.faults.monitor.arl import Calibration
 from optid.faults.monitor.columns import Window
 from optid.faults.monitor.decisions import Decisions
+from optid.faults.monitor.events import Carried
 from optid.faults.monitor.running_filter import Direction, RunningFilter
+from optid.faults.monitor.sizes import Recent
+from optid.faults.nuisance import ModelUncertainty
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Predictor
 from optid.models.files import from_content, read_state, write_state
 
-VERSION = 5
+VERSION = 6
 """Version of the file."""
 
 WORDS = "name", "kind", "columns", "members", "places", "bounded_deflection", "zero"
 PLACES = "into_state", "into_output"
 PREDICTOR = "A", "C", "L", "K", "covariance", "root"
+RECENT = "recent_u", "recent_y", "known_deviations"
 
 
 def _parts(monitor: Any) -> dict[str, tuple[Any, tuple[str, ...]]]:
@@ -44,7 +49,36 @@ def save(monitor: Any, path: str | Path) -> Path:
     arrays = {f"{word}_{name}": getattr(part, name) for word, (part, own) in _parts(monitor).items() for name in own}
     arrays |= {f"predictor_{name}": getattr(found.predictor, name) for name in PREDICTOR} | {"sines": found.sines}
     arrays |= {f"{place}_{i}": getattr(c, place) for i, c in enumerate(found.candidates) for place in PLACES}
+    if monitor.recent is not None:
+        more, own = _recent(monitor.recent)
+        head, arrays = head | more, arrays | own
     return write_state(path, "monitor", VERSION, head, arrays)
+
+
+def _recent(recent: Recent) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The head and the arrays of the last samples and of the model by which they are judged."""
+    known, curvature = recent.known, recent.known.curvature
+    head = {
+        "known": {"model": known.model.to_dict(), "readings": known.readings, "inflation": known.inflation,
+                  "deviation": known.deviation, "silent": known.predictor.silent,
+                  "levels": None if known.levels is None else known.levels.tolist(),
+                  "curvature": None if curvature is None else [curvature.low.tolist(), curvature.high.tolist()]},
+        "first": recent.first, "final": [[number, *vars(one).values()] for number, one in recent.final.items()],
+    }
+    arrays = {f"known_{name}": getattr(known.predictor, name) for name in PREDICTOR} | {
+        "recent_u": recent.u, "recent_y": recent.y, "known_deviations": known.root}
+    return head, arrays
+
+
+def _known(head: dict[str, Any], arrays: dict[str, np.ndarray], functions: dict[str, Any] | None) -> ModelUncertainty:
+    """The model by which the last samples are judged."""
+    model = from_content(head["model"], functions)
+    parts: dict[str, Any] = {name: arrays[f"known_{name}"] for name in PREDICTOR}
+    ends = head["curvature"]
+    curvature = None if ends is None else Products(np.array(ends[0]), np.array(ends[1]), model.m)
+    return ModelUncertainty(model, Predictor(**parts, silent=int(head["silent"])), arrays["known_deviations"],
+                            head["readings"], head["inflation"],
+                            None if head["levels"] is None else np.array(head["levels"]), head["deviation"], curvature)
 
 
 def load(monitor: Any, path: str | Path, functions: dict[str, Any] | None = None) -> None:
@@ -54,6 +88,7 @@ def load(monitor: Any, path: str | Path, functions: dict[str, Any] | None = None
         names = [f"{place}_{i}" for i in range(len(head["candidates"])) for place in PLACES]
         names += ["sines", *(f"predictor_{name}" for name in PREDICTOR)]
         names += [f"search_{name}" for name in Window.KEPT] + [f"plant_{name}" for name in RunningFilter.KEPT]
+        names += [*RECENT, *(f"known_{name}" for name in PREDICTOR)] if "known" in head else []
         _, arrays = read_state(path, "monitor", VERSION, names)
         candidates = []
         for i, c in enumerate(head["candidates"]):
@@ -64,7 +99,13 @@ def load(monitor: Any, path: str | Path, functions: dict[str, Any] | None = None
         steady = Predictor(**parts, silent=int(head["silent"]))
         found = Dictionary(from_content(head["model"], functions), steady, tuple(candidates), head["excluded"],
                            arrays["sines"], head["unknown"])
-        monitor._set(found, head["window"], head["seed"], head["rules"])
+        known = _known(head["known"], arrays, functions) if "known" in head else None
+        monitor._set(found, head["window"], head["seed"], head["rules"], known)
+        if monitor.recent is not None:
+            recent = monitor.recent
+            recent.u, recent.y, recent.first = arrays["recent_u"], arrays["recent_y"], head["first"]
+            recent.final = {number: Carried(label, tuple(size), tuple(deviation), tuple(map(tuple, interval)))
+                            for number, label, size, deviation, interval in head["final"]}
         monitor.calibration = Calibration.from_dict(head["calibration"])
         monitor.samples, monitor.source, monitor.remark = head["samples"], head["source"], head["remark"]
         for word, (part, own) in _parts(monitor).items():

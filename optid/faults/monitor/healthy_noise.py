@@ -11,7 +11,7 @@ from optid.arrays import Array, as_list
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults.monitor.arl import COMMON, Calibration
-from optid.faults.nuisance import CONFIDENCE, ModelUncertainty, sensitivities
+from optid.faults.nuisance import CONFIDENCE, ModelUncertainty
 from optid.faults.ranges import outside, unsure_since
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import OTHER_SCALE, Predictor, health, whiten
@@ -56,7 +56,7 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
         here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
         there = ~np.isnan(here.y)
         by_parameter, by_start = (known.predictor.flattened(effect, there) for effect in
-                                  sensitivities(known.model, known.predictor, here, x0, there, known.root))
+                                  known.sensitivities(here, x0, there))
         by_parameter -= by_start @ np.linalg.lstsq(by_start, by_parameter, rcond=None)[0]
         raw_effect = np.linalg.pinv(known.predictor.root) @ by_parameter.reshape(*here.y.shape, -1)
         n, l = known.model.nx, here.y.shape[1]  # noqa: E741

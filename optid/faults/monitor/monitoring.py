@@ -24,7 +24,8 @@ from optid.faults.monitor.healthy_noise import parameter_effect, raise_threshold
 from optid.faults.monitor.readings import ReadingChecks
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import expand
-from optid.faults.nuisance import ModelUncertainty, model_uncertainty
+from optid.faults.monitor.sizes import Recent
+from optid.faults.nuisance import ModelUncertainty, model_uncertainty, uncertain_start
 from optid.faults.signatures import Dictionary, dictionary
 from optid.identify.recursive.state import as_block
 from optid.models.experiments import state_like
@@ -37,6 +38,9 @@ KINDS_BY_DEFAULT = ("bias", "loss", "spike")
 
 INPUTS, HOLD = 20_000, 5
 """Samples of simulated input for the calibration, and samples per level."""
+
+NORMAL = 1.96
+"""Standard deviations of the ends of a 95 % interval."""
 
 BLOCK = 4096
 """Samples searched at a time."""
@@ -113,8 +117,9 @@ class Monitor:
                                                                                         decoupled=silent)
             found = replace(found, predictor=known.predictor)
             remarks.append(known.remark)
+        sized = uncertain_start(found.model, found.predictor) if known is None else known
         if drift is not None:
-            found = without_drift(found, drift)
+            found, sized = without_drift(found, drift), None
         if healthy is not None:
             found, remark = with_noise_of(found, healthy)
             remarks.append(remark)
@@ -123,9 +128,10 @@ class Monitor:
         self.remark = " ".join(filter(None, remarks))
         if known is not None and isinstance(uncertainty, Data):
             effect, inputs = parameter_effect(known, uncertainty, found.predictor)
-        rules = {**RULES, **({"beyond": 1.0} if known is None else {}), **rules}  # an exact model has no errors
+        exact = {"beyond": 1.0, "wrong": 0.0} if known is None else {}  # an exact model has no errors
+        rules = {**RULES, **exact, **rules}
         self._set(found, int(window), seed, rules | ({} if found.unknown else {"odd": np.inf}),
-                  None if known is None else known.levels)
+                  sized, None if known is None else known.levels)
         for c in found.candidates:
             if c.label in self.skipped and not c.is_sensor_gain:  # the gains of sensors are among the kinds by default
                 warnings.warn(f"{c.label} is not monitored: {self.skipped[c.label]}.", DataWarning, stacklevel=2)
@@ -143,8 +149,8 @@ class Monitor:
             self.plant.x[:] = state_like(x0, (model.nx,))
 
     def _set(self, found: Dictionary, window: int, seed: int | None, rules: dict[str, float],
-             levels: Array | None = None) -> None:
-        """Set up everything but the thresholds."""
+             known: ModelUncertainty | None = None, levels: Array | None = None) -> None:
+        """Set up everything but the thresholds; `known` is the model by which sizes are estimated."""
         self.dictionary, self.window, self.seed, self.source = found, window, seed, None
         chosen = searched([c for c in found.candidates if c.additive or c.columns])
         if not chosen:
@@ -162,10 +168,11 @@ class Monitor:
         self.columns = columns_of(model, chosen)
         self.search = Window(self.columns, window, model.nx + SPARE + 2 * int(self.columns.size.max()), steady)
         self.plant = RunningFilter(model, steady, self.columns)
-        self.checks = ReadingChecks(model, levels)
+        self.checks = ReadingChecks(model, window, levels)
         self.decisions = Decisions(self.columns, self.labels, np.full(len(chosen), np.inf), np.ones(len(chosen)), rules,
                                    model.outputs, np.ones(len(chosen), dtype=bool), [], found.candidates)
         self.samples = 0
+        self.recent = self.decisions.recent = None if known is None else Recent(known, window)
         self._functions = tabulated(model.nonlinearities)
         self._input_of, self._output_of = (np.array(of, dtype=np.int64) for of in (model.input_of, model.output_of))
 
@@ -269,6 +276,8 @@ class Monitor:
         frozen = np.isin(np.arange(count), list(screened.frozen))
         alone = np.isnan(y).any(axis=1) | screened.unsure.any(axis=1) | screened.repeating | frozen
         alone |= screened.distance > 1
+        if self.recent is not None:
+            self.recent.append(u, y, start)
         stops, events, k = np.append(np.flatnonzero(alone), count), list(screened.events), 0
         while k < count:
             self.decisions.forget_range(self.samples - self.window)
@@ -278,9 +287,12 @@ class Monitor:
             adapts = self.decisions.rules["adapt"] > 1
             if adapts:  # at multiples of the window
                 clean = min(clean, k + self.window - self.samples % self.window)
+            due = self._next_final()
+            clean = int(min(clean, k + due - self.samples))
             if clean > k and self.plant.certain and self.decisions.waiting:
                 k += self._search_block(f[k:clean], fed[k:clean], y[k:clean], events)
                 events += self._adapt() if adapts else []
+                self._keep_sizes(due, events)
                 continue
             if k in screened.frozen:
                 self._clear_fault(screened.frozen[k])
@@ -288,6 +300,7 @@ class Monitor:
                 self.decisions.leave_range(self.samples, float(screened.distance[k]))
             self._search_sample(f[k], fed[k], y[k], unsure[k], bool(screened.repeating[k]), events)
             events += self._adapt() if adapts else []
+            self._keep_sizes(due, events)
             k += 1
         return sorted(events, key=lambda e: e.sample)
 
@@ -332,6 +345,36 @@ class Monitor:
     def _adapt(self) -> list[Event]:
         return [] if self.samples % self.window else self.decisions.adapt(self.samples - 1)
 
+    # -- sizes ----------------------------------------------------------------------------------------------------
+
+    def _next_final(self) -> float:
+        """Return the next sample at which the size of a carried fault becomes final."""
+        if self.recent is None:
+            return np.inf
+        last = (self.recent.last(onset) for number, onset in self.decisions.onsets if number not in self.recent.final)
+        return min((sample for sample in last if sample > self.samples), default=np.inf)
+
+    def _keep_sizes(self, due: float, events: list[Event]) -> None:
+        """Keep sizes that are final at this sample, and discard samples with a fault that is over."""
+        recent, onsets = self.recent, {number: onset for number, onset in self.decisions.onsets}
+        if recent is None:
+            return
+        if self.samples >= due:
+            recent.final |= {number: one for number, one in self._estimates().items()
+                             if recent.last(onsets[number]) <= self.samples}
+        if events and events[-1].ends_fault and events[-1].sample == self.samples - 1:
+            recent.discard(self.samples)
+            recent.final = {number: one for number, one in recent.final.items() if number in onsets}
+
+    def _estimates(self) -> dict[int, Carried]:
+        """Return {number of the candidate: the fault} of the carried faults that the last samples show."""
+        if self.recent is None:
+            return {}
+        labels = {self.decisions.label_of(number): number for number, _ in self.decisions.onsets}
+        onsets = {self.decisions.label_of(number): onset for number, onset in self.decisions.onsets}
+        found = self.recent.estimate(onsets, self.dictionary.candidates, self.samples)
+        return {labels[label]: one for label, one in found.items()}
+
     # -- operators -------------------------------------------------------------------------------------------------
 
     def acknowledge(self) -> None:
@@ -343,6 +386,10 @@ class Monitor:
         plant = self.plant
         plant.release(list(range(len(plant.directions))), slice(0, len(plant.held)), self.search)
         self.decisions.passing, self.decisions.undecided, self.decisions.windows = [], [], []
+        self.decisions.onsets = []
+        if self.recent is not None:
+            self.recent.discard(self.samples)
+            self.recent.final = {}
         self.acknowledge()
         plant.lose()
 
@@ -399,16 +446,21 @@ class Monitor:
         """The isolated faults whose effect is compensated."""
         plant, size, found = self.plant, self.plant.held.copy(), []
         variance = plant.held_variance.copy()
+        estimates = self._estimates() | (self.recent.final if self.recent is not None else {})
         for at, one in enumerate(plant.directions, self.dictionary.model.nx):
             if self.columns.course[one.column] != DRIFT or one.growth > 0:
                 size[one.column] += plant.x[at]
                 variance[one.column] += plant.P[at, at]
         for number in range(len(self.labels)):
-            own = self.columns.of(number)
+            own, label = self.columns.of(number), self.decisions.label_of(number)
             if size[own].any() or any(one.owner == number for one in plant.directions):
+                if number in estimates and estimates[number].label == label:
+                    found.append(estimates[number])
+                    continue
                 spread = np.sqrt(self.decisions.spreads[number] * variance[own])
-                found.append(Carried(self.decisions.label_of(number), self.columns.in_order(number, size[own]),
-                                     self.columns.in_order(number, spread)))
+                sizes, spreads = (np.array(self.columns.in_order(number, part)) for part in (size[own], spread))
+                ends = zip(sizes - NORMAL * spreads, sizes + NORMAL * spreads)
+                found.append(Carried(label, tuple(sizes.tolist()), tuple(spreads.tolist()), tuple(ends)))
         return tuple(found)
 
     @property

@@ -14,8 +14,8 @@ BEYOND = 1.1
 """Distance from the middle of the range, in half ranges, from which a channel is far outside it; a linear function of
 an input is extrapolated further."""
 
-EXCURSIONS = 100
-"""Excursions that are kept."""
+REMEMBERED = 2
+"""Windows for which excursions are kept."""
 
 
 class Screened(NamedTuple):
@@ -23,7 +23,7 @@ class Screened(NamedTuple):
 
     y: Array  # (T, l) readings; those of frozen sensors are missing
     unsure: np.ndarray  # (T, m) inputs that are missing or so far outside their range that their effect is unknown
-    distance: Array  # (T,) largest distance of an input from the middle of its range, in half ranges; at least one
+    distance: Array  # (T,) largest distance of a channel from the middle of its range, in half ranges; at least one
     repeating: np.ndarray  # (T,) whether a sensor repeats the reading of the sample before
     events: list[Event]  # in the order of their samples
     frozen: dict[int, int]  # {sample of the block: onset in samples of the stream} of the sensors found frozen
@@ -40,10 +40,10 @@ class ReadingChecks:
         excursions: [channel, first sample, last sample or None] of channels far outside their range.
     """
 
-    def __init__(self, model: HammersteinSS, levels: Array | None = None) -> None:
+    def __init__(self, model: HammersteinSS, window: int, levels: Array | None = None) -> None:
         """Begin a stream; `levels` (2, l) are the lowest and highest readings of the identification, if known."""
         m, l = model.m, model.l  # noqa: E741
-        self.model, self.low, self.high = model, np.full(m, -np.inf), np.full(m, np.inf)
+        self.model, self.window, self.low, self.high = model, window, np.full(m, -np.inf), np.full(m, np.inf)
         self._lowest, self._highest = self.low.copy(), self.high.copy()
         for c, low, high, lowest, highest in zip(model.input_of, *known_range(model), *usable_range(model)):
             self.low[c], self.high[c] = max(self.low[c], low), min(self.high[c], high)
@@ -96,13 +96,16 @@ class ReadingChecks:
                     kept.append(open_[name])
                 else:
                     open_.pop(name)[2] = start + k - 1
-        self.excursions = (self.excursions + kept)[-EXCURSIONS:]
+        oldest = start - REMEMBERED * self.window
+        self.excursions = [one for one in self.excursions + kept if one[2] is None or one[2] >= oldest]
 
     def screen(self, u: Array, y: Array, start: int) -> Screened:
         """Check a block of inputs (T, m) and readings (T, l) that begins at the sample `start` of the stream."""
         outside, blind = np.asarray((u < self.low) | (u > self.high)), np.asarray(np.isnan(u).any(axis=1))
-        distance, (at, c) = np.ones(len(u)), np.nonzero(outside)
-        np.maximum.at(distance, at, np.abs(2 * u[at, c] - self.low[c] - self.high[c]) / (self.high[c] - self.low[c]))
+        distance = np.ones(len(u))
+        for low, high, values in ((self.low, self.high, u), *([(*self.levels, y)] if self.levels is not None else [])):
+            at, c = np.nonzero((values < low) | (values > high))
+            np.maximum.at(distance, at, np.abs(2 * values[at, c] - low[c] - high[c]) / (high[c] - low[c]))
         self._follow(u, y, start)
         clean, repeating, findings = self.sensors.screen(y, blind, start)
         unsure = np.asarray((u < self._lowest) | (u > self._highest) | np.isnan(u))

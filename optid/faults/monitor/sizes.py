@@ -1,0 +1,123 @@
+"""Sizes of carried faults, from the samples about their onsets by the formula of a diagnosis.
+
+The running filter compensates a fault as though the model were exact: its estimate becomes ever more certain, and the
+errors of the model pass for parts of the fault. What is reported is the estimate of a diagnosis of the last samples, in
+which these errors count. It is final once the samples before the onset are no longer kept.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import DataError
+from optid.faults.diagnosis.alternatives import family_of, split_by_kind
+from optid.faults.diagnosis.answers import Estimate
+from optid.faults.diagnosis.counting import with_model_uncertainty
+from optid.faults.diagnosis.posterior import Explanation, estimates, several, single
+from optid.faults.monitor.events import Carried
+from optid.faults.nuisance import ModelUncertainty
+from optid.faults.ranges import usable_samples
+from optid.faults.search.scanning import scan
+from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.whitening import whiten
+
+WINDOWS, BEFORE = 5, 1
+"""Windows of samples that are kept, and those of them before an onset that an estimate needs."""
+
+NEAR, MOST = 20, 3
+"""Samples on both sides of an onset that are tried, and the most faults that are estimated together."""
+
+COVERAGE = 0.95
+"""Of the intervals."""
+
+
+class Recent:
+    """The last samples of a stream, as the monitor has screened them.
+
+    Attributes:
+        known: the model and its uncertainty.
+        window: samples of the window of the monitor.
+        u, y: (T, m) and (T, l) the samples.
+        first: number of the first one.
+        final: {number of the candidate: the fault} of those whose onset is no longer kept.
+    """
+
+    def __init__(self, known: ModelUncertainty, window: int) -> None:
+        """Begin a stream."""
+        self.known, self.window, self.first = known, window, 0
+        self.final: dict[int, Carried] = {}
+        self.u, self.y = np.empty((0, known.model.m)), np.empty((0, known.model.l))
+
+    def append(self, u: Array, y: Array, start: int) -> None:
+        """Append a block that begins at a sample, and discard samples that are too old."""
+        if start != self.first + len(self.u):  # samples were skipped
+            self.u, self.y, self.first = self.u[:0], self.y[:0], start
+        drop = max(len(self.u) - WINDOWS * self.window, 0)
+        self.u, self.y = (np.vstack([kept[drop:], new]) for kept, new in ((self.u, u), (self.y, y)))
+        self.first += drop
+
+    def discard(self, before: int) -> None:
+        """Discard the samples before one, which show a fault that is over."""
+        self.u, self.y = self.u[before - self.first :], self.y[before - self.first :]
+        self.first = before
+
+    def last(self, onset: int) -> int:
+        """Return the sample before which an estimate of a fault is final."""
+        return onset + (WINDOWS - BEFORE) * self.window
+
+    def estimate(self, faults: dict[str, int], listed: Sequence[Candidate], now: int) -> dict[str, Carried]:
+        """Return {label: the fault} for {label: onset}, from the samples before `now`; empty where these are unusable.
+
+        Args:
+            faults: that are carried.
+            listed: the candidates of the dictionary.
+            now: number of samples.
+        """
+        labels = list(faults)
+        for found in self._explanations(faults, listed, now):
+            if [c.label for c in found.candidates] == labels:
+                count = len(found.search.whitened.r) if found.search is not None else 0
+                return {one.label: _carried(one) for one in estimates(found, COVERAGE, count, 2 * self.known.model.nx)}
+        return {}
+
+    def evidence(self, labels: Sequence[str], onset: int, listed: Sequence[Candidate], now: int) -> dict[str, float]:
+        """Return {label: logarithm of the likelihood} of what broke at an actuator since about an onset."""
+        families = dict.fromkeys(family_of(one).label for one in listed if one.label in labels)
+        found = [one for label in families for one in self._explanations({label: onset}, listed, now)]
+        return {one.candidates[0].label: one.log_evidence for one in found if one.candidates[0].label in labels}
+
+    def _explanations(self, faults: dict[str, int], listed: Sequence[Candidate], now: int) -> list[Explanation]:
+        """Return the explanations of the samples before `now` by faults, in all kinds of broken actuators."""
+        first = max(now - WINDOWS * self.window, self.first)
+        u, y = (rows[first - self.first : now - self.first] for rows in (self.u, self.y))
+        gaps = np.flatnonzero(np.isnan(u).any(axis=1))
+        start = int(gaps[-1]) + 1 if gaps.size else 0
+        model = self.known.model
+        onsets = [max(onset - first - start, 0) for onset in faults.values()]
+        families = {label: family_of(one) for one in listed for label in (one.label, family_of(one).label)}
+        chosen = [replace(families[label], into_state=families[label].into_state[: model.nx]) for label in faults]
+        try:
+            count, _ = usable_samples(model, u[start:])
+            if not chosen or len(chosen) > MOST or max(onsets) + model.nx + 2 > count:
+                return []
+            part = Data(u[start : start + count], y[start : start + count], model.dt, model.inputs, model.outputs)
+            white: Any = whiten(model, part, uncertainty=self.known)
+        except DataError:
+            return []
+        sines = np.full((len(chosen), len(chosen)), np.nan)
+        search = scan(Dictionary(model, self.known.predictor, tuple(chosen), {}, sines), white, part.u)
+        if len(chosen) > 1:
+            return split_by_kind(several(search, chosen, onsets, 1), listed)
+        search.statistic[:, np.abs(np.arange(count) - onsets[0]) > NEAR] = np.nan
+        found = single(search, chosen[0])
+        return [] if found is None else split_by_kind(with_model_uncertainty(found, self.known), listed)
+
+
+def _carried(one: Estimate) -> Carried:
+    size = np.where(np.isnan(one.size), one.size_interval.mean(axis=1), one.size)
+    return Carried(one.label, tuple(size.tolist()), tuple(np.sqrt(np.diag(one.covariance)).tolist()),
+                   tuple((float(low), float(high)) for low, high in one.size_interval))
