@@ -11,7 +11,7 @@ from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.waveforms import waveform_matrix
 from optid.faults.search.scanning import ALIKE
-from optid.faults.search.subsets import exchanged
+from optid.faults.search.subsets import exchange_search
 from optid.faults.signatures import Candidate
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ class CourseProblem:
             k = int(np.argmax(energies))
             return float(along @ along + energies[k]), (0, k)
 
-        _, found = exchanged([(0, int(k)) for k in kept], -1.0, best_beside)
+        _, found = exchange_search([(0, int(k)) for k in kept], -1.0, best_beside)
         return np.unique([k for _, k in found]).astype(int)
 
 

@@ -15,10 +15,12 @@ from optid.kernel_cache import cached_njit
 
 
 class Grams(NamedTuple):
-    """What the products of signatures of any two onsets follow from, with the tables and roots of a sweep."""
+    """What the products of signatures of any two onsets follow from, with the tables of a sweep."""
 
     products: Array  # (N, D, D) of columns with the same onset
     states: Array  # (N, n, D) of a unit state with the columns
+    along: Array  # (N, Q, D) the reduction of the products by an uncertain model, and by axes projected out
+    roots: Array  # (N, R) inverse roots of the products of every candidate
 
 
 @cached_njit
@@ -67,14 +69,12 @@ def joint_energy(first, second, cosines, floor, work):
 
 
 @cached_njit
-def search(tables, grams, along, roots, tested, z, q, floor):
+def search(tables, grams, tested, z, q, floor):
     """Find the best pair of onsets for every pair of candidates.
 
     Args:
         tables: `optid.faults.search.sweeps.SweepTables`.
         grams: `Grams`.
-        along: (N, Q, D) what is taken off the products, of `optid.faults.search.sweeps.Sweep`.
-        roots: (N, R) inverse roots of the products of every candidate.
         tested: (C, N) which onsets count.
         z: (N, D) coordinates of the window along the axes of every candidate.
         q: (C,) thresholds.
@@ -85,7 +85,7 @@ def search(tables, grams, along, roots, tested, z, q, floor):
         onsets: (C, C, 2) of the first and of the second candidate, -1 where none.
         alike: number of pairs of which only one is seen.
     """
-    products, states = grams
+    products, states, along, roots = grams
     of, F, e = tables.of, tables.F, tables.e
     lasting, drifts, helpers = tables.lasting, tables.drifts, tables.helpers
     count, n, columns, candidates = of.size, F.shape[1], e.shape[2], tables.first.size

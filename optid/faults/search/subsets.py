@@ -151,7 +151,7 @@ def best_subsets(
         alike = found.alike if size == 2 else alike
     if near is not None and not near.all():
         for gain, members in best.ranked[:EXCHANGED]:
-            best.offer(*exchanged(members, gain, columns.best_beside))
+            best.offer(*exchange_search(members, gain, columns.best_beside))
     ranked = []
     for gain, members in best.ranked:
         names, onsets = zip(*((scan.labels[c], k) for c, k in members))
@@ -160,7 +160,7 @@ def best_subsets(
     return SubsetSearch(scan, tuple(ranked), searched, subsets, alike)
 
 
-def exchanged(
+def exchange_search(
     members: Sequence[Member], gain: float, best_beside: Callable[[Sequence[Member]], tuple[float, Member]]
 ) -> tuple[float, list[Member]]:
     """Return the gain and the members that no single exchange improves, from members of some gain.
@@ -210,7 +210,7 @@ class _Columns:
 
     scan: Scan
     q: Array  # (C,) thresholds
-    grams: "Grams"  # products of the signatures, before the projection
+    grams: "Grams"
     sweep: Sweep
     correlations: Array  # (N, D)
     chosen: tuple[Member, ...] = ()
@@ -226,7 +226,8 @@ class _Columns:
         n, D = tables.F.shape[1], tables.group.size
         products, states = np.zeros((window, D**2)), np.empty((window, n, D))
         grams(tables, np.arange(D**2).reshape(D, D), products, states)
-        return cls(scan, q, Grams(products.reshape(-1, D, D), states), scan.sweep, scan.correlations)
+        known = Grams(products.reshape(-1, D, D), states, scan.sweep.along, scan.sweep.roots)
+        return cls(scan, q, known, scan.sweep, scan.correlations)
 
     def beside(self, members: Sequence[Member]) -> "_Columns":
         """Choose faults, these only: project them out of the window and of all signatures."""
@@ -237,8 +238,9 @@ class _Columns:
         along = axes.T @ r.ravel()
         sweep = whole.without(axes, ALIKE)
         gain = float(along @ along) - float(sum(self.q[c] for c, _ in members))
-        return replace(self, sweep=sweep, correlations=sweep.correlations(r - (axes @ along).reshape(r.shape)),
-                       chosen=tuple(members), gain=gain)
+        grams = self.grams._replace(along=sweep.along, roots=sweep.roots)
+        correlations = sweep.correlations(r - (axes @ along).reshape(r.shape))
+        return replace(self, grams=grams, sweep=sweep, correlations=correlations, chosen=tuple(members), gain=gain)
 
     def best_beside(self, others: Sequence[Member]) -> tuple[float, Member]:
         """Return the gain of some faults and of the best one beside them, and this one."""
@@ -275,8 +277,7 @@ class _Columns:
         sweep, z = self.sweep, np.zeros_like(self.correlations)
         for c in np.flatnonzero(sweep.tables.sizes).tolist():
             z[:, sweep.columns(c)] = sweep.coordinates(self.correlations, c)
-        gains, onsets, alike = search(sweep.tables, self.grams, sweep.along, sweep.roots, tested & sweep.tested, z,
-                                      self.q, ALIKE)
+        gains, onsets, alike = search(sweep.tables, self.grams, tested & sweep.tested, z, self.q, ALIKE)
         found = _Best(int(alike))
         for i, j in np.argwhere(np.isfinite(gains)).tolist():
             first, second = onsets[i, j].tolist()
