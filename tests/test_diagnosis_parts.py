@@ -26,7 +26,7 @@ from optid.faults.diagnosis.posterior import (
     single,
     smallest_set,
 )
-from optid.faults.search.subsets import pairs
+from optid.faults.search.subsets import best_subsets
 from optid.faults.search.sweeps import sweep
 from optid.faults.whitening import Whitened
 
@@ -81,7 +81,7 @@ def test_two_candidates_together_are_dense_least_squares(found):
     u = np.repeat(np.random.default_rng(1).uniform(-1, 1, (12, 2)), 5, axis=0)
     search = scan(found, whitened, u)
     limits = thresholds(found, 60, u=u, draws=5000)
-    best = pairs(search, limits).ranked[0]
+    best = best_subsets(search, limits).best_of(2)
     candidates = [found[label] for label in best.labels]
     together = several(search, candidates, best.onsets, 4)
     assert together.energies.max() == pytest.approx(best.energy, rel=1e-8)

@@ -10,7 +10,7 @@ from test_fault_scan import KINDS, LOAD, random_model, record
 
 from optid import Data
 from optid.errors import DataWarning, StructureError
-from optid.faults import Fault, dictionary, inject, model_uncertainty, pairs, scan, thresholds, whiten
+from optid.faults import Fault, best_subsets, dictionary, inject, model_uncertainty, scan, thresholds, whiten
 from optid.faults.search.calibration import Thresholds
 
 
@@ -29,37 +29,40 @@ def dense(result, limits):
             G = result.signature(candidate, int(onset)).reshape(r.size, -1)
             axes, values, _ = np.linalg.svd(G, full_matrices=False)
             atoms.append((c, onset, axes[:, values > 3e-5 * values[0]]))
-    best, where = np.full((size, size), -np.inf), {}
+    best, where, alike = np.full((size, size), -np.inf), {}, 0
     for i, (c, k, first) in enumerate(atoms):
         for other, j, second in atoms[i + 1 :]:
             beside = second - first @ (first.T @ second)
             axes, values, _ = np.linalg.svd(beside, full_matrices=False)
             axes = axes[:, values > np.sqrt(2e-6)]
             if not axes.shape[1]:
+                alike += 1
                 continue
             gain = np.sum((first.T @ r) ** 2) + np.sum((axes.T @ r) ** 2) - limits.q[c] - limits.q[other]
             low, high = sorted(((c, k), (other, j)))
             if gain > best[low[0], high[0]]:
                 best[low[0], high[0]] = gain
                 where[low[0], high[0]] = low[1], high[1]
-    return best, where
+    return best, where, alike
 
 
 def compare(result, limits):
-    found = pairs(result, limits)
-    best, where = dense(result, limits)
+    found = best_subsets(result, limits)
+    best, where, _ = dense(result, limits)
+    ranked = [subset for subset in found.ranked if len(subset.labels) == 2]
     there = np.isfinite(best)
-    gains = {tuple(result.labels.index(label) for label in pair.labels): pair.gain for pair in found.ranked}
+    gains = {tuple(result.labels.index(label) for label in pair.labels): pair.gain for pair in ranked}
     assert set(gains) == set(map(tuple, np.argwhere(there).tolist()))
     np.testing.assert_allclose([gains[i, j] for i, j in np.argwhere(there)], best[there], rtol=1e-5, atol=1e-5)
     top = np.unravel_index(np.argmax(best), best.shape)
-    assert found.ranked[0].labels == tuple(result.labels[i] for i in top)
+    assert found.best_of(2) == ranked[0] and ranked[0].labels == tuple(result.labels[i] for i in top)
+    assert ranked[0].onsets == where[top]
     signatures = [result.signature(label, onset).reshape(result.whitened.r.size, -1)
-                  for label, onset in zip(found.ranked[0].labels, found.ranked[0].onsets)]
+                  for label, onset in zip(ranked[0].labels, ranked[0].onsets)]
     nu = np.linalg.lstsq(np.hstack(signatures), result.whitened.r.ravel(), rcond=None)[0]
-    fitted = np.hstack(signatures) @ found.estimate(found.ranked[0]).nu
+    fitted = np.hstack(signatures) @ found.estimate(ranked[0]).nu
     np.testing.assert_allclose(fitted, np.hstack(signatures) @ nu, atol=1e-5)
-    assert abs(np.sum(fitted**2) - found.ranked[0].energy) < 1e-4 * found.ranked[0].energy
+    assert abs(np.sum(fitted**2) - ranked[0].energy) < 1e-4 * ranked[0].energy
     return found
 
 
@@ -100,23 +103,21 @@ def test_two_faults_are_found(real_data):
     y = inject(model, u, [Fault.step("actuator:u1", 160, 0.2), Fault.step("sensor:y2", 220, 0.15)], seed=2)
     result = scan(found, whiten(model, Data(u, y), x0="zero"))
     limits = thresholds(found, 300, draws=5000)
-    two = pairs(result, limits)
-    assert two.best is not None and two.two and two.best.labels == ("actuator:u1", "sensor:y2")
+    two = best_subsets(result, limits)
+    assert two.best is not None and two.best.labels == ("actuator:u1", "sensor:y2")
     assert abs(two.best.onsets[0] - 160) <= 2 and abs(two.best.onsets[1] - 220) <= 2
     nu, covariance = two.estimate(two.best)
     assert np.all(np.abs(nu - [0.2, 0.15]) < 4 * np.sqrt(np.diag(covariance)))
     assert two.runner_up is not None and set(two.runner_up.labels) != set(two.best.labels) and two.margin > 0
     assert max(map(len, str(two).splitlines())) <= 80
-    same = pairs(result, limits, same=False)
-    assert same.best == two.best and all(len(set(pair.labels)) == 2 for pair in same.ranked)
 
 
 def test_one_fault_is_not_called_two():
     model, u = small(), levels(120, 0)
     found = dictionary(model)
     result = scan(found, whiten(model, Data(u, inject(model, u, Fault.step("sensor:y1", 60, 0.8), seed=1)), x0="zero"))
-    two = pairs(result, thresholds(found, 120, draws=5000))
-    assert not two.two and two.single > two.gain > 0
+    two = best_subsets(result, thresholds(found, 120, draws=5000))
+    assert two.best.labels == ("sensor:y1",) and two.gain > two.best_of(2).gain > 0
 
 
 def test_faults_that_look_the_same_near_the_end_are_reported():
@@ -125,9 +126,9 @@ def test_faults_that_look_the_same_near_the_end_are_reported():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         found = dictionary(model, state_jump=False)
-    two = pairs(scan(found, whiten(model, record(model, 30, 0))), penalties(found))
-    assert (("actuator:u", "sensor:y"), (29, 29)) in [(a.labels, a.onsets) for a in two.indistinguishable]
-    assert two.alike == len(two.indistinguishable) and "indistinguishable" in str(two)
+    result, limits = scan(found, whiten(model, record(model, 30, 0))), penalties(found)
+    two = best_subsets(result, limits)
+    assert two.alike == dense(result, limits)[2] > 0 and "indistinguishable" in str(two)
 
 
 def test_bad_input():
@@ -137,7 +138,7 @@ def test_bad_input():
     long = scan(found, whiten(model, record(model, 12_000, 0)))
     refused(
         (StructureError, "no threshold for actuator:u1 loss.*u=u",
-         lambda: pairs(result, thresholds(found, 40, draws=5000))),
-        (StructureError, "other candidates", lambda: pairs(result, penalties(dictionary(model)))),
-        (StructureError, "too many for all pairs", lambda: pairs(long, penalties(found))),
+         lambda: best_subsets(result, thresholds(found, 40, draws=5000))),
+        (StructureError, "other candidates", lambda: best_subsets(result, penalties(dictionary(model)))),
+        (StructureError, "too many for an exact search", lambda: best_subsets(long, penalties(found))),
     )

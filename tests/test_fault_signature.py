@@ -15,9 +15,9 @@ from optid.core.program import as_program
 from optid.errors import LookupFailed, StructureError
 from optid.faults import (
     Fault,
+    best_subsets,
     dictionary,
     model_uncertainty,
-    polish,
     scan,
     signature_estimate,
     thresholds,
@@ -178,7 +178,6 @@ def test_a_solver_that_lies_is_not_believed(found, limits):
     result = signature_estimate(s, limits, solver=liar(0.05))
     assert not result.certified and "not stationary" in result.status
     assert not any(mask.any() for mask in result.provably_zero.values())
-    assert not polish(s, limits, result).certified
 
 
 def test_lying_multipliers_give_no_false_bound(found, limits):
@@ -228,8 +227,7 @@ def test_a_solver_without_a_point_gives_no_certificate(found, limits, answer):
     mute = BackEnd("none", frozenset(), lambda *_: answer, form="group-sparse", takes=GroupSparseForm.of)
     result = signature_estimate(s, limits, solver=mute)
     assert not result.certified and not result.active and result.status and np.isinf(result.gap)
-    search = polish(s, limits, result)
-    assert search.best is None and not search.certified
+    assert best_subsets(s, limits, near=result.near()).best is None
     assert "not certified" in str(result) and max(map(len, str(result).splitlines())) <= 80
 
 
@@ -248,7 +246,7 @@ def test_equal_to_brute_force_over_all_subsets(found, limits, size, missing):
     faults = [Fault.step("sensor:y1", 12, 0.5), Fault.jump("state", 20, [0.8, -0.8, 0.4]),
               Fault.step("actuator:u1", 28, 0.8)]
     s = scan(found, window(found, 2, faults, missing), onsets=[11, 12, 20, 28])
-    search = polish(s, limits, max_faults=size)
+    search = best_subsets(s, limits, max_faults=size)
     atoms = [(label, k) for label in found.labels for k in (11, 12, 20, 28)
              if not np.isnan(s.statistic[s.labels.index(label), k])]
     values = {members: dense_gain(s, limits, members) for k in range(1, size + 1) for members in combinations(atoms, k)}
@@ -267,8 +265,8 @@ def test_equal_to_brute_force_over_all_subsets(found, limits, size, missing):
 
 def test_magnitudes_are_least_squares_and_two_faults_are_found(found, limits):
     s = two(found)
-    search = polish(s, limits, signature_estimate(s, limits))
-    assert search.best.labels == ("actuator:u2", "sensor:y1") and search.certified
+    search = best_subsets(s, limits, near=signature_estimate(s, limits).near())
+    assert search.best.labels == ("actuator:u2", "sensor:y1")
     assert np.all(np.abs(np.array(search.best.onsets) - [25, 10]) <= 2)
     nu, covariance = search.estimate(search.best)
     assert np.all(np.abs(nu - [1.5, 0.9]) < 5 * np.sqrt(np.diag(covariance)))
@@ -283,9 +281,9 @@ def test_magnitudes_are_least_squares_and_two_faults_are_found(found, limits):
 def test_exchanges_never_lose_and_end_where_no_single_one_gains(found, limits):
     for seed in range(3):
         s = two(found, seed)
-        result = signature_estimate(s, limits)
-        plain, better = (polish(s, limits, result, reach=1, exchange=e) for e in (False, True))
-        everywhere = polish(s, limits)
+        near = signature_estimate(s, limits).near(1)
+        plain = best_subsets(scan(found, s.whitened, onsets=np.flatnonzero(near)), limits)
+        better, everywhere = best_subsets(s, limits, near=near), best_subsets(s, limits)
         assert plain.gain - 1e-9 <= better.gain <= everywhere.gain + 1e-7
         members = list(zip(better.best.labels, better.best.onsets))
         assert better.gain == pytest.approx(dense_gain(s, limits, members), rel=1e-7)
@@ -306,11 +304,12 @@ def test_bad_input(found, limits):
     backwards, none = replace(limits, labels=limits.labels[::-1]), replace(limits, q=np.full(len(limits.q), np.nan))
     refused(
         *((StructureError, "penalty=", lambda p=p: signature_estimate(s, limits, penalty=p)) for p in (0, -1, np.nan)),
-        *((StructureError, "max_faults must be", lambda k=k: polish(s, limits, max_faults=k)) for k in (0, 1.5, -1)),
+        *((StructureError, "max_faults must be", lambda k=k: best_subsets(s, limits, max_faults=k))
+          for k in (0, 1.5, -1)),
         (StructureError, "other candidates", lambda: signature_estimate(s, backwards)),
         (StructureError, "no threshold", lambda: signature_estimate(s, none)),
         (StructureError, "shorter window", lambda: atoms_of(wide, limits)),
-        (StructureError, "too many for an exact search", lambda: polish(s, limits, max_faults=6)),
+        (StructureError, "too many for an exact search", lambda: best_subsets(s, limits, max_faults=6)),
         (LookupFailed, "fault.signature", lambda: fault_formulation("fault.signatur")),
         (StructureError, "not convex",
          lambda: signature_estimate(s, limits, constraints=[lambda v: cp.norm(v["size[sensor:y1]"]) >= 1])),
@@ -323,6 +322,6 @@ def test_a_healthy_window_gives_nothing(found, limits):
     s = scan(found, window(found, 3))
     result = signature_estimate(s, limits)
     assert not result.alarm and result.clusters == () and not result.near().any()
-    search = polish(s, limits, result)
+    search = best_subsets(s, limits, near=result.near())
     assert search.best is None and search.gain == -np.inf and search.margin == np.inf
     assert "no fault gains" in str(search)

@@ -18,8 +18,8 @@ from plants import BEFORE, PLANT, levels, standard_plant
 from scipy.stats import norm
 
 from optid import Data
-from optid.faults import Fault, dictionary, inject, whiten
-from optid.faults.isolability import MIDDLE, study
+from optid.faults import Fault, dictionary, inject, isolability, whiten
+from optid.faults.isolability_study import MIDDLE
 from optid.faults.signatures import Dictionary
 
 
@@ -51,7 +51,7 @@ def main() -> None:
     model, load = standard_plant(options.plant)
     found = dictionary(model, process={"load": load})
     start = time.process_time()
-    forecast = study(found, options.window, draws=options.draws)
+    forecast = isolability(found, options.window, draws=options.draws)
     print(f"{forecast}\n\nforecast in {time.process_time() - start:.1f} s of CPU time; Monte Carlo with {options.runs} "
           "records each\n")
     banks = dense(found, options.window)

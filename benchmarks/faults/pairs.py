@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from plants import PLANT, deflected, rate, standard_plant, windows
 
-from optid.faults import dictionary, pairs, scan, thresholds
+from optid.faults import best_subsets, dictionary, scan, thresholds
 
 WINDOW = 200
 SEARCHED = 186
@@ -47,11 +47,12 @@ def main() -> None:
             result = scan(found, window.whitened, onsets=slice(0, SEARCHED))
             atoms = int(np.sum(~np.isnan(result.statistic)))
             start = time.process_time()
-            best = pairs(result, limits)
+            found_two = best_subsets(result, limits)
             spent.append(time.process_time() - start)
-            assert best.best is not None
-            two += best.two
-            right = set(best.best.labels) == set(labels)
+            best = found_two.best_of(2)
+            assert best is not None
+            two += best == found_two.best
+            right = set(best.labels) == set(labels)
             both += right
             gains = result.gains(limits)
             c, at = np.unravel_index(np.nanargmax(gains), gains.shape)
@@ -60,10 +61,10 @@ def main() -> None:
             rest = scan(found, left, onsets=slice(0, SEARCHED)).gains(limits)
             greedy += {found.labels[c], found.labels[np.nanargmax(np.nanmax(rest, axis=1))]} == set(labels)
             if right:
-                order = [best.best.labels.index(label) for label in labels]
-                errors += [abs(best.best.onsets[i] - k) for i, k in zip(order, onsets)]
-                nu = best.estimate(best.best).nu
-                middle = found[best.best.labels[0]].dimension
+                order = [best.labels.index(label) for label in labels]
+                errors += [abs(best.onsets[i] - k) for i, k in zip(order, onsets)]
+                nu = found_two.estimate(best).nu
+                middle = found[best.labels[0]].dimension
                 parts = nu[:middle], nu[middle:]
                 sizes += [np.linalg.norm(parts[i] - size) / np.linalg.norm(size) for i, size in zip(order, true)]
         print(f"deflection {d:g} each, {options.runs} windows")

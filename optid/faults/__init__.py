@@ -18,7 +18,7 @@ _HOME = {
     "consistency.bounded_noise": ["Membership"],
     "consistency.profiles": ["Profile"],
     "search.sparse": ["SparseResult"],
-    "search.subsets": ["pairs", "polish", "SubsetSearch"],
+    "search.subsets": ["best_subsets", "SubsetSearch"],
     "consistency.waveforms": ["waveform_test", "WaveformTest"],
     "consistency.noise_changes": ["noise_test", "noise_search", "NoiseTest"],
     "monitor.monitoring": ["Monitor"],

@@ -1,6 +1,6 @@
 """The course of one fault over time: result, and the regression it is estimated from."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -10,7 +10,8 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.waveforms import waveform_matrix
-from optid.faults.search.atoms import Atoms, exchanged
+from optid.faults.search.scanning import ALIKE
+from optid.faults.search.subsets import exchange_search
 from optid.faults.signatures import Candidate
 
 if TYPE_CHECKING:
@@ -146,9 +147,20 @@ class CourseProblem:
     def moved(self, columns: Array, kept: np.ndarray) -> np.ndarray:
         """Move every change to its best sample beside the others, until none moves; arguments as of `pruned`."""
         sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        each = Atoms("change", np.arange(self.count), (columns / sizes).T[:, :, None], np.ones((self.count, 1, 1)), 0.0)
-        _, found = exchanged([each], self.r, [("change", int(k)) for k in kept], -1.0)
-        return np.unique([place for _, place in found]).astype(int)
+        unit = columns / sizes
+
+        def best_beside(others: Sequence[tuple[int, int]]) -> tuple[float, tuple[int, int]]:
+            axes, values, _ = np.linalg.svd(unit[:, [k for _, k in others]], full_matrices=False)
+            axes = axes[:, values > np.sqrt(ALIKE)]
+            along, shared = axes.T @ self.r, axes.T @ unit
+            left = np.sum(unit**2, axis=0) - np.sum(shared**2, axis=0)
+            energies = np.full(self.count, -np.inf)
+            np.divide((unit.T @ (self.r - axes @ along)) ** 2, left, out=energies, where=left > ALIKE)
+            k = int(np.argmax(energies))
+            return float(along @ along + energies[k]), (0, k)
+
+        _, found = exchange_search([(0, int(k)) for k in kept], -1.0, best_beside)
+        return np.unique([k for _, k in found]).astype(int)
 
 
 def course_problem(found: "Scan", label: str) -> CourseProblem:

@@ -16,7 +16,7 @@ from optid.faults.diagnosis.posterior import Explanation, several, single, small
 from optid.faults.diagnosis.record_search import RecordSearch
 from optid.faults.programmes import solved
 from optid.faults.search.scanning import scan
-from optid.faults.search.subsets import SubsetSearch, pairs, polish
+from optid.faults.search.subsets import SubsetSearch, best_subsets
 
 if TYPE_CHECKING:
     from optid.faults.search.sparse import SparseResult
@@ -128,7 +128,7 @@ def _exact(seen: RecordSearch, count: int) -> Ranking:
         exhaustive = stride == 1
         if not exhaustive:
             search = scan(search.dictionary, seen.whitened, search.u, onsets=slice(None, None, stride))
-        explanations += _several(seen, pairs(search, seen.limits), stride)
+        explanations += _several(seen, best_subsets(search, seen.limits), stride)
     ranking = ranked(seen, explanations)
     note = "" if exhaustive else "Two faults were searched on a grid of onsets."
     if not ranking.fits:
@@ -227,7 +227,7 @@ def _by_programme(seen: RecordSearch) -> Ranking:
         return Ranking(note="The solver found no point.")
     if asked.method == "sparse+polish":
         reach = NEAR if asked.max_faults < 3 else NEAR_OF_MANY
-        found = polish(search, limits, result, max_faults=asked.max_faults, reach=reach)
+        found = best_subsets(search, limits, max_faults=asked.max_faults, near=result.near(reach))
         ranking = ranked(seen, singles(seen) + _several(seen, found))
     else:  # the strongest group of every cluster, estimated again without the penalty
         active = [g for g in result.active if g.label not in seen.lost]

@@ -13,16 +13,13 @@ import numpy as np
 from optid.arrays import Array
 from optid.kernel_cache import cached_njit
 
-LISTED = 1000
-"""Most indistinguishable pairs that are listed."""
-
 
 class Grams(NamedTuple):
     """What the products of signatures of any two onsets follow from, with the tables of a sweep."""
 
     products: Array  # (N, D, D) of columns with the same onset
     states: Array  # (N, n, D) of a unit state with the columns
-    along: Array  # (N, Q, D) the reduction of the products by an uncertain model
+    along: Array  # (N, Q, D) the reduction of the products by an uncertain model, and by axes projected out
     roots: Array  # (N, R) inverse roots of the products of every candidate
 
 
@@ -72,7 +69,7 @@ def joint_energy(first, second, cosines, floor, work):
 
 
 @cached_njit
-def search(tables, grams, tested, z, q, same, floor):
+def search(tables, grams, tested, z, q, floor):
     """Find the best pair of onsets for every pair of candidates.
 
     Args:
@@ -81,14 +78,12 @@ def search(tables, grams, tested, z, q, same, floor):
         tested: (C, N) which onsets count.
         z: (N, D) coordinates of the window along the axes of every candidate.
         q: (C,) thresholds.
-        same: whether both faults may be of one candidate.
         floor: see `joint_energy`.
 
     Returns:
         best: (C, C) above the diagonal and on it, largest energy less both thresholds, -inf where none.
         onsets: (C, C, 2) of the first and of the second candidate, -1 where none.
-        alike: (K, 4) candidate, onset, candidate, onset of the first `LISTED` pairs of which only one is seen.
-        found: number of all of these pairs.
+        alike: number of pairs of which only one is seen.
     """
     products, states, along, roots = grams
     of, F, e = tables.of, tables.F, tables.e
@@ -104,7 +99,11 @@ def search(tables, grams, tested, z, q, same, floor):
     for c in range(candidates):
         for other in range(candidates):
             best[c, other], onsets[c, other, 0], onsets[c, other, 1] = -np.inf, -1, -1
-    alike, found = np.empty((LISTED, 4), dtype=np.int64), 0
+    alike, last = 0, 0
+    for k in range(count):
+        for c in range(candidates):
+            if tested[c, k]:
+                last = k
     for theta in range(count):
         any_here = False
         for c in range(candidates):
@@ -114,7 +113,7 @@ def search(tables, grams, tested, z, q, same, floor):
         for a in range(n):
             for i in range(columns):
                 x[a, i] = 0.0
-        for k in range(theta, count):
+        for k in range(theta, last + 1):
             t = of[k]
             age = k - theta
             for i in range(columns):
@@ -136,7 +135,7 @@ def search(tables, grams, tested, z, q, same, floor):
                 if not tested[c, theta]:
                     continue
                 for other in range(candidates):
-                    if not tested[other, k] or (age == 0 and other <= c) or (other == c and not same):
+                    if not tested[other, k] or (age == 0 and other <= c):
                         continue
                     dc, bc, pc = tables.sizes[c], tables.first[c], tables.places[c]
                     do, bo, po = tables.sizes[other], tables.first[other], tables.places[other]
@@ -159,16 +158,14 @@ def search(tables, grams, tested, z, q, same, floor):
                         energy = joint_energy(z[first, b1 : b1 + d1], z[second, b2 : b2 + d2], cosines[:d1, :d2],
                                               floor, work[:d2, : d2 + 1])
                     if energy < 0:
-                        if found < alike.shape[0]:
-                            alike[found, 0], alike[found, 1], alike[found, 2], alike[found, 3] = c, theta, other, k
-                        found += 1
+                        alike += 1
                         continue
                     gain = energy - q[c] - q[other]
                     low, high = min(c, other), max(c, other)
                     if gain > best[low, high]:
                         best[low, high] = gain
                         onsets[low, high, 0], onsets[low, high, 1] = (theta, k) if c <= other else (k, theta)
-            if k + 1 < count:
+            if k < last:
                 for i in range(columns):
                     share = 1.0 if age == 0 or i < lasting else age + 1.0 if i < lasting + drifts else 0.0
                     for a in range(n):
@@ -180,4 +177,4 @@ def search(tables, grams, tested, z, q, same, floor):
                 for a in range(n):
                     for i in range(columns):
                         x[a, i] = later[a, i]
-    return best, onsets, alike[: min(found, LISTED)], found
+    return best, onsets, alike

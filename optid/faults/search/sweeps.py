@@ -11,7 +11,7 @@ so that correlations are those of the plain signatures with S r, and products lo
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -81,7 +81,8 @@ class Sweep:
         roots: (N, R) inverse roots of the products, row by row and candidate after candidate; zero rows for directions
             that have no effect.
         tested: (C, N) whether the candidate is tested at the onset.
-        along: V (N, q, D): an uncertain model takes V' V off the products of the columns; q is zero without one.
+        along: V (N, q, D): an uncertain model, and axes projected out, take V' V off the products of the columns; q is
+            zero without them.
     """
 
     found: Dictionary
@@ -105,6 +106,24 @@ class Sweep:
     def columns(self, c: int) -> slice:
         """Return the columns of a candidate among the correlations."""
         return slice(int(self.tables.first[c]), int(self.tables.first[c] + self.tables.sizes[c]))
+
+    def without(self, axes: Array, share: float) -> "Sweep":
+        """Project axes (N l, q), orthonormal, out of all signatures, like a nuisance of infinite variance.
+
+        Directions of which less than this share of their energy is left explain nothing.
+        """
+        taken = np.empty((self.window, axes.shape[1], self.tables.group.size))
+        for i, axis in enumerate(axes.T):
+            taken[:, i] = self.correlations(axis.reshape(self.white.r.shape))
+        roots, tested = np.zeros_like(self.roots), np.zeros_like(self.tested)
+        for c in np.flatnonzero(self.tables.sizes).tolist():
+            root, place = self.roots_of(c), int(self.tables.places[c])
+            shared = root @ np.swapaxes(taken[:, :, self.columns(c)], 1, 2)
+            own = np.any(root, axis=2)[:, :, None] * np.eye(root.shape[1])  # zero for a direction without effect
+            left = inverse_roots(own - shared @ np.swapaxes(shared, 1, 2), np.ones(self.window), share)
+            roots[:, place : place + root[0].size] = (left @ root).reshape(self.window, -1)
+            tested[c] = self.tested[c] & np.any(left, axis=(1, 2))
+        return replace(self, roots=roots, tested=tested, along=np.concatenate([self.along, taken], axis=1))
 
     def signature(self, c: int, onset: int) -> Array:
         """Return the whitened signature (N, l, d) of a candidate that has one."""
