@@ -627,7 +627,7 @@ def test_simulations_that_cannot_be():
 
 
 IN_CLASS = [("dead_zone_in_span", "hammerstein_arx.exact"), ("ding_chen", "hammerstein_armax.exact"),
-            ("linear", "oe.exact"), ("two_modes", "hammerstein_ss.sid")]
+            ("linear", "oe.exact"), ("two_modes", "hammerstein_ss.sid"), ("step_test", "process.exact")]
 
 
 @pytest.mark.sampled(1)

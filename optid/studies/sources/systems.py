@@ -83,11 +83,15 @@ class DifferenceEquation:
     dt: float = 0.1
     gaussian: bool = False  # whether the input is standard normal instead
     power: float | None = None  # variance of the noise-free output; that of the record where None
+    hold: int = 1  # samples for which the input keeps a value; if there are several, the first value is zero
 
     def simulate(self, samples: int, noise: float, seed: int) -> tuple[Data, Truth]:
         """Simulate with a noise relative to the standard deviation of the noise-free output."""
         rng = np.random.default_rng(seed)
-        u = rng.standard_normal(samples) if self.gaussian else rng.uniform(-self.most, self.most, samples)
+        moves = -(-samples // self.hold)
+        levels = rng.standard_normal(moves) if self.gaussian else rng.uniform(-self.most, self.most, moves)
+        u = np.repeat(levels, self.hold)[:samples]
+        u[: self.hold] *= self.hold == 1
         e = rng.standard_normal(samples)
         poles = np.concatenate([[1.0], self.a])
         clean = lfilter(self.b, poles, self.f(u))
@@ -111,6 +115,8 @@ _DING_A, _DING_B, _DING_D = np.array([-1.60, 0.80]), np.array([0.0, 0.85, 0.65])
 # Moments of the standard normal distribution: var(u + u^2 / 2 + u^3 / 4) = 1 + 2 / 4 + 15 / 16 + 2 * 3 / 4.
 _DING_POWER = 3.9375 * float(np.sum(_impulse(_DING_B, _DING_A) ** 2))
 _DING_NOISE = 0.5 * float(np.sqrt(np.sum(_impulse(_DING_D, _DING_A) ** 2) / _DING_POWER))
+_STEP_TAU, _STEP_LATE = 8.0, 0.4  # samples; the dead time is five whole ones longer
+_STEP_B = np.r_[np.zeros(6), -np.diff(np.exp(-np.array([0.0, 1 - _STEP_LATE, 1.0]) / _STEP_TAU))]
 
 
 # -- plants with states ------------------------------------------------------------------------------------------------
@@ -171,6 +177,11 @@ SYSTEMS: dict[str, System] = {
         "f(u) = tanh(1.5 u) before second-order dynamics, white noise on the output",
         1000, 0.1, DifferenceEquation(_A, _B, np.r_[1.0, _A], lambda u: np.tanh(1.5 * u)).simulate,
         {"na": 2, "nb": 2, "basis": "polynomial:5", "nx": 2}),
+    "step_test": System(
+        "one time constant of 8 s behind a dead time of 5.4 s, moved every 25 samples, white noise on the output",
+        400, 0.1, DifferenceEquation(-np.exp([-1 / _STEP_TAU]), _STEP_B, np.r_[1.0, -np.exp(-1 / _STEP_TAU)],
+                                     lambda u: u, dt=1.0, hold=25).simulate,
+        {"na": 1, "nb": 2, "nk": 6, "nx": 2, "process": "P1D"}),
     "ding_chen": System(
         "the Hammerstein ARMAX example of Ding and Chen (Automatica 41, 2005), a cubic and coloured noise",
         3000, _DING_NOISE,
