@@ -4,6 +4,7 @@ A second-order factor stands for two poles, real or complex; where the chosen on
 fitted with these.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from optid.identify.process.starts import best_descents, usual_box
 from optid.models.process_dynamics import ProcessStructure
 
 CANDIDATES = ("P1", "P1D", "P2U", "P2DU", "P2DZU", "P3DU", "P0DI", "P1DI")
+GENERAL = ProcessStructure.read("P2DU")  # the type beside which bases are compared
 EVIDENCE = 2.0  # difference of the criterion up to which two types are not distinguishable (Kass and Raftery 1995)
 FLOOR = 1e-20  # share of the energy of the output below which errors are rounding
 
@@ -32,6 +34,19 @@ def try_type(errors: ProcessErrors, structure: ProcessStructure) -> tuple[float,
     if structure.pair and best.numbers[structure.names.index("zeta")] >= 0:
         structure = replace(structure, real=structure.real + 2, pair=False)
     return criterion, structure
+
+
+def best_basis(several: Sequence[ProcessErrors]) -> int:
+    """Return which of the errors with different bases has the least criterion beside two poles with dead time.
+
+    A basis comes before a type: dynamics would be bent to explain what a coarse static curve leaves.
+    """
+    def criterion(errors: ProcessErrors) -> float:
+        if len(errors.y) < 2 * (errors.unknowns.size + len(GENERAL.names) * len(errors.unknowns.pairs)):
+            return np.inf
+        return sum(try_type(one, GENERAL)[0] for one in errors.each)
+
+    return int(np.argmin([criterion(one) for one in several])) if len(several) > 1 else 0
 
 
 def choose_types(errors: ProcessErrors) -> tuple[ProcessErrors, str]:

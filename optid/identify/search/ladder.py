@@ -6,6 +6,7 @@ from the best structures of earlier ones.
 """
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -13,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from optid.data.record import Data
-from optid.errors import OptidError
+from optid.errors import OptidError, RankError
 from optid.identify.blocks import Blocks
 from optid.identify.informativity import Informativity, Process, informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.levels import LevelEvidence, level_evidence
-from optid.identify.process.order import choose_types
+from optid.identify.process.order import best_basis, choose_types
 from optid.identify.process.record import Terms, process_errors
 from optid.identify.search.determined import determined_bases
 from optid.identify.search.trial import CLEAR, FEEDBACK, INPUTS, KINDS, LATENT, LINEAR, StructureCandidate, Trial, near
@@ -209,14 +210,15 @@ def linear_models(ladder: Ladder) -> Rung:
                for n in dict.fromkeys([max(a["na"] - 1, 1), a["na"], a["na"] + 1])]
 
 
-def processes_by_criterion(ladder: Ladder, kind: str, basis: Any = "linear") -> StructureCandidate:
-    """Return processes of the types that the Bayesian information criterion chooses for all pairs.
+def processes_by_criterion(ladder: Ladder, kind: str, bases: Sequence[Any] = ("linear",)) -> StructureCandidate:
+    """Return processes with the basis, and of the types for all pairs, that the Bayesian information criterion chooses.
 
     The errors raised are those of `choose_types`.
     """
-    errors = choose_types(process_errors(ladder.data, "P1D", basis, Terms(initial="free")))[0]
-    words = [one.word for one in errors.unknowns.structures]
-    curve = {} if isinstance(basis, str) and basis == "linear" else {"basis": basis}
+    errors = [process_errors(ladder.data, "P1D", basis, Terms(initial="free")) for basis in bases]
+    place = best_basis(errors)
+    words = [one.word for one in choose_types(errors[place])[0].unknowns.structures]
+    curve = {} if bases[place] == "linear" else {"basis": bases[place]}
     return structure(kind, "process.exact", process=words, initial="free", **curve)
 
 
@@ -273,7 +275,9 @@ def input_functions(ladder: Ladder) -> Rung:
     """Static functions of the inputs before linear dynamics."""
     words = [ladder.bases(word) for word in ("polynomial:3", "triangular:6")]
     if not ladder.data.is_regular:
-        yield [processes_by_criterion(ladder, INPUTS, word) for word in words]
+        more = [ladder.bases(word) for word in ("triangular:8", "triangular:10")]
+        with suppress(RankError):  # too few samples for functions of the inputs: straight lines are left
+            yield [processes_by_criterion(ladder, INPUTS, [*words, *more])]
         return
     if not ladder.single:
         yield from _of_several_outputs(ladder, words)
