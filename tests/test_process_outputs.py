@@ -233,6 +233,21 @@ def test_a_search_at_irregular_times_tries_processes():
     assert found.fit.params["dead_time"].estimate == pytest.approx(3.4, abs=0.2)
 
 
+@pytest.mark.slow
+def test_a_coarse_static_curve_does_not_bend_the_type():
+    from optid.identify.process.order import best_basis, choose_types
+    from optid.identify.process.record import Terms, process_errors
+
+    rng = np.random.default_rng([2, 41])
+    t, u = np.cumsum(rng.uniform(0.3, 1.7, 400)), np.repeat(rng.uniform(-1, 1, size=40), 10)
+    y = plant("P2D", K=2.0, level=5.0, tau1=8.0, tau2=3.0, dead_time=3.4).respond(
+        np.clip(u, -0.5, 0.5)[:, None], instants=t)
+    data = optid.Data(u, y + 0.02 * np.ptp(y) * rng.normal(size=400), times=t)
+    errors = [process_errors(data, "P1D", basis, Terms(initial="free")) for basis in ("triangular:6", "triangular:8")]
+    assert choose_types(errors[0])[1].startswith("P2DZ")  # 15 better than P2D by the criterion
+    assert best_basis(errors) == 1 and choose_types(errors[1])[1].startswith("P2D by")
+
+
 def test_parts_of_a_record_keep_their_times():
     data = irregular()
     first, second = data.split(0.5)
