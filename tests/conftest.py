@@ -19,27 +19,24 @@ settings.register_profile("optid", derandomize=True, deadline=None, max_examples
                           suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("optid")
 
+# marks of modules, and of the folders that end in a stroke
 CORE = """bases certificate cli data fitting infeasibility models prices rank_one readers readme registry regressors
 report solving study_database validation""".split()
-NUMERICAL = """backends certificate fault_pairs fault_profile fault_scan fault_signature fitting formulations
-gauss_newton golden_fits group_sparse hammerstein_ss hankel_bound infeasibility lifting noise_models nuclear_norm
-nuclear_subspace output_error prices rank_one readme shift shooting solving state_space_exact subspace
+NUMERICAL = """solving/ formulations/ fault_pairs fault_profile fault_scan fault_signature fitting readme
 uncertainty""".split()
-
-
-SLOW = """clusters diagnosis encoding fault_alternatives fault_empirical fault_scan hard_over isolability monitor
+SLOW = """workbench/ clusters diagnosis encoding fault_alternatives fault_scan hard_over isolability monitor
 monitor_arl monitor_cli physical processes random_commands real_faults reformulation solver_fallback state_shooting
-study_cli study_cluster study_description study_examples study_running study_third_party study_verdict_figures
-study_workers workbench""".split()
+study_cli study_description study_examples study_running study_third_party study_verdict_figures
+study_workers""".split()
 
 
 def pytest_collection_modifyitems(items):
-    """Mark tests by module and fixture; of a test that is `sampled(n)` all but the first n parameters are slow."""
+    """Mark tests by folder, module and fixture; of a test that is `sampled(n)` all but the first n are slow."""
     seen = Counter()
     for item in items:
-        module = item.path.stem.removeprefix("test_")
-        for mark, modules in {"core": CORE, "numerical": NUMERICAL, "slow": SLOW}.items():
-            if module in modules:
+        places = {f"{item.path.parent.name}/", item.path.stem.removeprefix("test_")}
+        for mark, marked in {"core": CORE, "numerical": NUMERICAL, "slow": SLOW}.items():
+            if places & set(marked):
                 item.add_marker(mark)
         function = f"{item.path}::{item.originalname}"
         seen[function] += 1

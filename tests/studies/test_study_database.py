@@ -5,6 +5,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+import study_rows
 from study_rows import rows
 
 from optid.errors import DatabaseError, DataError, OptidError
@@ -256,7 +257,8 @@ def test_two_processes_write_into_one_database(path):
     program = ("import sys; sys.path.insert(0, sys.argv[1]); from study_rows import rows; "
                "from optid.studies.storage.store import append; "
                "[append(sys.argv[2], [{**row, 'study': sys.argv[3]}]) for row in rows(60)]")
-    started = [subprocess.Popen([sys.executable, "-c", program, str(Path(__file__).parent), str(path), name])
+    started = [subprocess.Popen([sys.executable, "-c", program, str(Path(study_rows.__file__).parent), str(path),
+                                name])
                for name in ("one", "two")]
     assert [process.wait() for process in started] == [0, 0]
     assert [len(finished(path, name)) for name in ("one", "two")] == [60, 60]

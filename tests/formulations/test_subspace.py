@@ -340,8 +340,3 @@ def test_units_and_offsets_of_the_channels_do_not_matter():
     np.testing.assert_allclose(np.sort_complex(models[0].poles), np.sort_complex(models[1].poles), atol=1e-5)
 
 
-def test_models_of_detrended_and_scaled_data_come_back_in_raw_units():
-    data = example1(1200, 0.05, 0.2, closed=False, offset=(30.0, -5.0))
-    raw = quiet(data, "hammerstein_ss.sid", nx=3, basis="polynomial:3").model
-    scaled = quiet(data.detrend().scale(), "hammerstein_ss.sid", nx=3, basis="polynomial:3").model
-    np.testing.assert_allclose(scaled.simulate(data, x0="fit"), raw.simulate(data, x0="fit"), atol=2e-2)

@@ -104,22 +104,6 @@ def test_start_satisfies_the_programme_and_judging_is_ours():
     assert program.kind == "NLP"
 
 
-def test_units():
-    data = plain()
-    options = ORDERS | {"basis": "triangular:4"}
-    fit = optid.fit(data, hammerstein_oe, solver="ipopt", **options)
-    scaled = optid.fit(data.detrend().scale(), hammerstein_oe, solver="ipopt", **options)
-    assert scaled.model.theta() == pytest.approx(fit.model.theta(), rel=1e-4, abs=1e-5)
-
-
-@pytest.mark.parametrize("factor", [1e-3, 1e3])
-def test_small_and_large_units(factor):
-    data = plain()
-    fit = optid.fit(Data(data.u, factor * data.y), hammerstein_oe, solver="ipopt", **ORDERS)
-    reference = optid.fit(data, "hammerstein_oe.exact", **ORDERS)
-    assert fit.solution.objective == pytest.approx(factor**2 * reference.solution.objective, rel=1e-6)
-
-
 @pytest.mark.parametrize(("name", "channels", "orders"), [
     ("lab_hydraulic_actuator", ("u_valve", "y_pressure"), {"na": 3, "nb": 2, "basis": "triangular:6"}),
     ("daisy_robotarm", ("u", "y"), {"na": 4, "nb": 4, "basis": "linear"}),

@@ -192,15 +192,6 @@ def test_gauges_describe_the_same_model(gauge):
     assert fit.solution.objective == pytest.approx(reference.solution.objective, rel=1e-8)
 
 
-@pytest.mark.parametrize("kind", ORDERS)
-def test_changed_units_give_the_same_model(kind):
-    data, (pose, orders) = record(system(kind), (300,)), ORDERS[kind]
-    orders = orders | {"basis": Triangular(4)}
-    fit, scaled = optid.fit(data, pose, **orders), optid.fit(data.detrend().scale(), pose, **orders)
-    assert scaled.model.theta() == pytest.approx(fit.model.theta(), rel=1e-5, abs=1e-6)
-    assert scaled.model.predict(data) == pytest.approx(fit.model.predict(data), abs=1e-5, nan_ok=True)
-
-
 @pytest.mark.slow
 def test_gaps_cost_no_more_than_their_samples():
     """The estimate on a record with gaps stays near the one without, and its variance within that of the rows left."""

@@ -56,7 +56,7 @@ def test_rows_that_break_the_schema_are_refused(change, words):
 
 
 def test_documentation_names_every_column_and_outcome():
-    text = (Path(__file__).parents[1] / "examples/studies/schema.md").read_text()
+    text = (Path(__file__).parents[2] / "examples/studies/schema.md").read_text()
     assert text == markdown(), "write it anew: optid study schema > examples/studies/schema.md"
     assert all(f"| `{name}` |" in text for name in BY_NAME)
     assert all(f"| {word} |" in text for word in OUTCOMES)

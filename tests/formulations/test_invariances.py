@@ -1,4 +1,4 @@
-"""The same model in any units and about any level: every formulation, with and without constraints."""
+"""The same model in any units, about any level, and in any order of the channels: registered formulations."""
 
 import warnings
 
@@ -12,6 +12,7 @@ from formulations.constraints import shape
 from optid.errors import DataWarning
 from optid.identify.uncertainty import uncertainty
 from optid.program.units import in_units, inverse, own_units
+from optid.registry import FORMULATIONS, registered
 
 GRID = np.linspace(-0.9, 0.9, 7)
 PROBE = np.random.default_rng(5).uniform(-0.9, 0.9, (60, 1))
@@ -48,12 +49,15 @@ CASES = {
     "asivid": ("hammerstein_ss.asivid", STATES | CUBIC | {"feedback_basis": "polynomial:2"}, None),
     "ss": ("ss.exact", STATES, None), "hammerstein ss": ("hammerstein_ss.exact", STATES | CUBIC, None),
     "prediction": ("hammerstein_ss.exact", STATES | CUBIC | {"criterion": "prediction"}, None),
+    "process": ("process.exact", {"process": "P2DU"}, None),
 }
-LOOSE = {
+LOOSE = {  # to the accuracy of semidefinite programmes, and of a likelihood
     "nuclear": ("hammerstein_arx.nuclear", ARX | HATS, curve),
     "subspace.nuclear": ("subspace.nuclear", STATES | {"weight": 30.0}, None),
-    "poles": ("hammerstein_ss.sid", STATES | CUBIC, poles),
+    "poles": ("hammerstein_ss.sid", STATES | CUBIC, poles), "fir": ("fir", {"nb": 10}, None),
 }
+ELSEWHERE = {"physical", "lfr.shooting", "lfr.exact", "wiener_ss.exact", "hammerstein_wiener_ss.exact"}  # long descents
+LONG = {"hammerstein ss", "prediction", "process"}  # with two inputs
 WEIGHED = ("ss.exact", "ss.shooting", "subspace.nuclear")  # errors in units of their own variances, or of the outputs
 
 
@@ -109,8 +113,40 @@ def test_units_do_not_matter(name, constrained):
 
 
 @pytest.mark.parametrize("name", LOOSE)
-def test_units_do_not_matter_to_the_accuracy_of_semidefinite_programmes(name):
-    same(LOOSE[name], 1e-7, name != "subspace.nuclear", [(1e9, 1e-9), (1e-9, 1.0)])
+def test_units_do_not_matter_to_the_accuracy_of_the_method(name):
+    same(LOOSE[name], 1e-6, LOOSE[name][2] is not None, [(1e9, 1e-9), (1e-9, 1.0)])
+
+
+def test_every_registered_formulation_is_tested():
+    assert {name for name, *_ in (CASES | LOOSE).values()} == set(registered(FORMULATIONS)) - ELSEWHERE
+
+
+@pytest.mark.sampled(8)
+@pytest.mark.parametrize("name", CASES)
+def test_a_detrended_and_scaled_record_gives_the_model_of_the_raw_one(name):
+    formulation, arguments, _ = CASES[name]
+    u, y = record()
+    raw = optid.Data(u=3 * u + 5, y=1e-2 * y - 7)
+    one, other = (optid.fit(data, formulation, **arguments) for data in (raw, raw.detrend().scale()))
+    p, q = (fit.model.simulate(3 * PROBE + 5) for fit in (one, other))
+    assert p == pytest.approx(q, abs=1e-5 * np.std(p))
+
+
+@pytest.mark.sampled(8)
+@pytest.mark.parametrize("name", [one for one in CASES if one not in LONG])
+def test_the_order_of_the_channels_does_not_matter(name):
+    """Two inputs, and of models with states two outputs, which no fit may treat by their place."""
+    formulation, arguments, _ = CASES[name]
+    (u, y), (v, z) = record(1), record(2)
+    inputs, outputs = np.column_stack([u, v]), (y + 0.5 * z)[:, None]
+    if "nx" in arguments:
+        outputs = np.column_stack([outputs, z - 0.4 * y])
+    probe = np.column_stack([PROBE, PROBE[::-1]])
+    one = optid.fit(optid.Data(inputs, outputs), formulation, **arguments)
+    other = optid.fit(optid.Data(inputs[:, ::-1], outputs[:, ::-1]), formulation, **arguments)
+    p, q = one.model.simulate(probe), other.model.simulate(probe[:, ::-1])[:, ::-1]
+    assert other.solution.objective == pytest.approx(one.solution.objective, rel=1e-6)
+    assert p == pytest.approx(q, abs=1e-4 * np.std(p))
 
 
 @settings(max_examples=12, deadline=None)

@@ -10,7 +10,7 @@ import pytest
 from optid.studies import grid
 from optid.studies.study import Study
 
-FOLDER = Path(__file__).parent.parent / "examples" / "studies"
+FOLDER = Path(__file__).parents[2] / "examples" / "studies"
 STUDIES = sorted(path.stem for path in FOLDER.glob("*.toml"))
 CELLS = {"constraints_under_noise": 1600, "monte_carlo": 7000, "relaxations": 1520}
 """Those whose number does not depend on the solvers that are installed; the headers say it."""

@@ -224,16 +224,6 @@ def test_simulations_do_not_depend_on_the_gauge(gauge, words):
     assert abs(value) < 1e-8
 
 
-@pytest.mark.parametrize("change", [lambda d: d.detrend(), lambda d: d.scale(), lambda d: d.detrend().scale()])
-def test_units_are_undone(change):
-    data = record()
-    raw = optid.Data(u=30 + 4 * data.u, y=-7 + 0.01 * data.y, dt=0.5)
-    one = optid.fit(raw, "hammerstein_oe.exact", na=2, nb=2, basis=Triangular(4))
-    other = optid.fit(change(raw), "hammerstein_oe.exact", na=2, nb=2, basis=Triangular(4))
-    p, q = one.model.simulate(raw, x0="fit"), other.model.simulate(raw, x0="fit")
-    assert np.max(np.abs(p - q)) < 1e-4 * np.std(p)
-
-
 def test_offset_can_be_held_at_zero():
     data = record(siso(basis=BASIS, offset=0.0))
     fit = fitted(data, offset=False)

@@ -14,7 +14,7 @@ from optid.errors import DataWarning
 from optid.identify import verdict
 from optid.identify.informativity import effect, excitation, feedback, process, record
 
-DOCS = Path(__file__).parent.parent / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 BLOCK = re.compile(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", re.DOTALL)
 """Code of a page, and what it prints where that follows; "..." stands for lines that are left out."""
 PAGES = [page for page in sorted(DOCS.glob("*.md")) if BLOCK.search(page.read_text(encoding="utf-8"))]

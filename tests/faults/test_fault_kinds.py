@@ -25,7 +25,7 @@ from optid.faults import (
 )
 from optid.faults.kinds import DRIFT, JUMP, KINDS, all_kinds, kind_of
 
-THEIRS = Path(__file__).parent / "third_party"
+THEIRS = Path(__file__).parents[1] / "third_party"
 
 
 @pytest.fixture

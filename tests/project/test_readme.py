@@ -11,7 +11,7 @@ from optid.conformance.checks import check_formulation
 from optid.examples import example
 from optid.registry import FORMULATIONS, registered
 
-HOME = Path(__file__).parent.parent
+HOME = Path(__file__).parents[2]
 PAGES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md"))]
 MEASURED = re.compile(r"(?<![\w.])[\d.]+(e[-+]\d+)? (ms|s|µs)\b|(?<=gap )\d\.\de-\d+|\de-\d{3}\b")
 """Times, the gap, which is a rounding error of the bound, and probabilities that are rounding errors."""

@@ -16,7 +16,7 @@ from optid.cli.app import app
 from optid.cli.options import in_options, option_of
 from optid.errors import DataError
 
-FORMATS = Path(__file__).parents[1] / "docs" / "formats.md"
+FORMATS = Path(__file__).parents[2] / "docs" / "formats.md"
 BY_NAME = {one.name: one for one in EXPORTS}
 
 

@@ -23,6 +23,37 @@ DREW = ("new Promise((done) => { setTimeout(done, 1000); "
         "requestAnimationFrame(() => requestAnimationFrame(done)); })")
 KEYS = {"Enter": (13, "\r"), "Tab": (9, ""), "Escape": (27, ""), "ArrowLeft": (37, ""), "ArrowRight": (39, ""),
         "ArrowUp": (38, ""), "ArrowDown": (40, ""), " ": (32, " ")}
+# expressions that list what is wrong with a page: texts one over another, ink too close to its ground
+OVERLAPS = """[...document.querySelectorAll('.plot svg')].flatMap((svg) => {
+  const texts = [...svg.querySelectorAll('text')].map((t) => [t.textContent, t.getBoundingClientRect()]);
+  return texts.flatMap(([a, p], i) => texts.slice(i + 1).filter(([, q]) =>
+    p.left < q.right - 1 && q.left < p.right - 1 && p.top < q.bottom - 1 && q.top < p.bottom - 1)
+    .map(([b]) => `${svg.getAttribute('aria-label')}: ${a} over ${b}`));
+})"""
+
+CONTRAST = """(() => {
+  const canvas = document.createElement('canvas').getContext('2d', { willReadFrequently: true });
+  const rgba = (colour) => { canvas.clearRect(0, 0, 1, 1); canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1);
+    const d = canvas.getImageData(0, 0, 1, 1).data; return [d[0], d[1], d[2], d[3] / 255]; };
+  const over = (top, low) => [0, 1, 2].map((k) => top[k] * top[3] + low[k] * (1 - top[3])).concat(1);
+  const light = (c) => [0, 1, 2].map((k) => c[k] / 255)
+    .map((v) => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4)
+    .reduce((sum, v, k) => sum + v * [.2126, .7152, .0722][k], 0);
+  const found = [];
+  for (const one of document.querySelectorAll('body *')) {
+    if (![...one.childNodes].some((n) => n.nodeType === 3 && n.data.trim())) continue;
+    if (['SCRIPT', 'STYLE', 'NOSCRIPT'].includes(one.tagName)) continue;
+    if (!one.getClientRects().length) continue;
+    const style = getComputedStyle(one), layers = [];
+    for (let up = one; up; up = up.parentElement) layers.push(rgba(getComputedStyle(up).backgroundColor));
+    let back = [255, 255, 255, 1];
+    for (const layer of layers.reverse()) back = over(layer, back);
+    const ink = over(rgba(one instanceof SVGElement ? style.fill : style.color), back);
+    const [a, b] = [light(ink), light(back)].sort((p, q) => q - p), ratio = (a + .05) / (b + .05);
+    if (ratio < 4.5) found.push(`${one.tagName} "${one.textContent.slice(0, 30)}" ${ratio.toFixed(2)}`);
+  }
+  return [...new Set(found)];
+})()"""
 
 
 def look(page: Path, folder: Path, *options: str) -> subprocess.CompletedProcess:

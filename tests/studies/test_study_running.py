@@ -25,6 +25,7 @@ from optid.studies.study import Study
 
 STUDY = Study("trouble", (DataEntry("none", system="dead_zone"),),
               (FormulationEntry("f", "arx", (), {"na": 1, "nb": 1}),), (SolverEntry("s", "clarabel"),))
+PATHS = [str(Path(file).parent) for file in (study_trouble.__file__, __file__)]
 
 
 @pytest.fixture
@@ -283,7 +284,7 @@ def test_rows_of_a_run_through_a_link_that_was_killed_are_found_without_the_link
     link.symlink_to(path)
     program = f"""
 import os, sys
-sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
+sys.path[:0] = {PATHS}
 from study_trouble import cell
 from optid.studies.execution import running
 from test_study_running import STUDY, Hands
@@ -369,7 +370,7 @@ def test_a_real_study_from_python_to_its_frame():
 
 DRIVER = """
 import sys
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {paths}
 from functools import partial
 from study_trouble import behave, cell
 from optid.studies.execution import running
@@ -385,7 +386,7 @@ running.run(STUDY, {path!r}, execute=partial(run_here, function=behave, workers=
 def test_killed_at_any_moment_and_run_again_every_cell_is_there_once(path, tmp_path, grid):
     count, log = 60, tmp_path / "log"
     log.touch()
-    program = DRIVER.format(tests=str(Path(study_trouble.__file__).parent), log=str(log), count=count, path=str(path))
+    program = DRIVER.format(paths=PATHS, log=str(log), count=count, path=str(path))
 
     def begun():
         return len(log.read_text().splitlines())
@@ -410,7 +411,7 @@ def test_a_full_disk_stops_cleanly_and_the_next_run_goes_on(path, grid):
     """Files may grow to a size only."""
     program = f"""
 import resource, signal, sys
-sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
+sys.path[:0] = {PATHS}
 from study_trouble import cell
 from optid.errors import DatabaseError
 from optid.studies.execution import running

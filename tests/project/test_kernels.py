@@ -93,12 +93,13 @@ print(*(len(kernel.signatures) for kernel in (kernels.march, kernels.sensitiviti
 @pytest.mark.slow
 def test_kernels_stay_within_their_arrays(tmp_path):
     """Every kernel is called by one of these tests, with every index checked."""
-    tests = Path(__file__).parent
+    tests = Path(__file__).parents[1]
     names = ["recursion", "recursions", "tracking", "latent_signals", "hammerstein_ss", "noise_sensitivities",
              "group_sparse", "fault_pairs", "fault_injection", "monitor", "plants", "regressors", "process",
              "process_responses", "continuous"]
-    files = [tests / f"test_{name}.py" for name in names]
-    done = subprocess.run([sys.executable, tests / "kernels_within_bounds.py", *files], cwd=tmp_path,
+    files = [path for name in names for path in tests.glob(f"*/test_{name}.py")]
+    assert len(files) == len(names)
+    done = subprocess.run([sys.executable, tests / "helpers/kernels_within_bounds.py", *files], cwd=tmp_path,
                           capture_output=True, text=True,
                           env={**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path / "cache")})
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.core
 
 @pytest.fixture
 def positive(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parent / "third_party"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "third_party"))
     from optid_third_party import positive as theirs
 
     monkeypatch.setitem(back_ends(), "active_set", theirs.back_end)

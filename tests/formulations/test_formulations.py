@@ -182,17 +182,6 @@ def test_predictions_do_not_depend_on_the_gauge(gauge):
     assert np.linalg.norm(one.model.b[0]) == pytest.approx(1) and one.model.b[0][0] > 0
 
 
-@pytest.mark.parametrize("change", [lambda d: d.detrend(), lambda d: d.scale(), lambda d: d.detrend().scale()])
-@pytest.mark.parametrize("basis", [Triangular(6), Polynomial(3), BSpline(4)], ids=str)
-def test_units_are_undone(change, basis):
-    data = record()
-    raw = optid.Data(u=30 + 4 * data.u, y=-7 + 0.01 * data.y, dt=0.5)
-    one = optid.fit(raw, na=2, nb=2, basis=basis)
-    other = optid.fit(change(raw), na=2, nb=2, basis=basis)
-    p, q = one.model.predict(raw), other.model.predict(raw)
-    assert np.nanmax(np.abs(p - q)) < 1e-8 * np.nanmax(np.abs(p - np.nanmean(p)))
-
-
 def test_the_exact_objective_is_never_above_that_of_the_splits():
     data = record(count=60, noise=1.0, seed=3)
     exact = optid.fit(data, na=2, nb=2, basis=BASIS)

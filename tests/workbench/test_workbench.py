@@ -16,9 +16,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, NO_BROWSER, Browser
+from browser import CHROMIUM, CONTRAST, NO_BROWSER, OVERLAPS, Browser
 from sample_fits import two_by_two
-from test_pages import CONTRAST, OVERLAPS
 
 import optid
 from formulations.constraints.poles import disc

@@ -4,18 +4,11 @@ import re
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, DREW, NO_BROWSER, Browser
+from browser import CHROMIUM, CONTRAST, DREW, NO_BROWSER, OVERLAPS, Browser
 from sample_fits import example_fit, feedback_fit, mimo_fit, two_by_two
 
 import optid
 from optid import report
-
-OVERLAPS = """[...document.querySelectorAll('.plot svg')].flatMap((svg) => {
-  const texts = [...svg.querySelectorAll('text')].map((t) => [t.textContent, t.getBoundingClientRect()]);
-  return texts.flatMap(([a, p], i) => texts.slice(i + 1).filter(([, q]) =>
-    p.left < q.right - 1 && q.left < p.right - 1 && p.top < q.bottom - 1 && q.top < p.bottom - 1)
-    .map(([b]) => `${svg.getAttribute('aria-label')}: ${a} over ${b}`));
-})"""
 
 COVERED = """[...document.querySelectorAll('h3, .legend button, .zoom button, figcaption')].flatMap((one, i, all) =>
   all.slice(i + 1).filter((other) => { if (!one.offsetParent || !other.offsetParent) return false;
@@ -25,30 +18,6 @@ COVERED = """[...document.querySelectorAll('h3, .legend button, .zoom button, fi
     const p = text(one, a), q = text(other, b);
     return p.left < q.right - 1 && q.left < p.right - 1 && p.top < q.bottom - 1 && q.top < p.bottom - 1; })
   .map((other) => `${one.textContent} | ${other.textContent || other.ariaLabel}`))"""
-
-CONTRAST = """(() => {
-  const canvas = document.createElement('canvas').getContext('2d', { willReadFrequently: true });
-  const rgba = (colour) => { canvas.clearRect(0, 0, 1, 1); canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1);
-    const d = canvas.getImageData(0, 0, 1, 1).data; return [d[0], d[1], d[2], d[3] / 255]; };
-  const over = (top, low) => [0, 1, 2].map((k) => top[k] * top[3] + low[k] * (1 - top[3])).concat(1);
-  const light = (c) => [0, 1, 2].map((k) => c[k] / 255)
-    .map((v) => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4)
-    .reduce((sum, v, k) => sum + v * [.2126, .7152, .0722][k], 0);
-  const found = [];
-  for (const one of document.querySelectorAll('body *')) {
-    if (![...one.childNodes].some((n) => n.nodeType === 3 && n.data.trim())) continue;
-    if (['SCRIPT', 'STYLE', 'NOSCRIPT'].includes(one.tagName)) continue;
-    if (!one.getClientRects().length) continue;
-    const style = getComputedStyle(one), layers = [];
-    for (let up = one; up; up = up.parentElement) layers.push(rgba(getComputedStyle(up).backgroundColor));
-    let back = [255, 255, 255, 1];
-    for (const layer of layers.reverse()) back = over(layer, back);
-    const ink = over(rgba(one instanceof SVGElement ? style.fill : style.color), back);
-    const [a, b] = [light(ink), light(back)].sort((p, q) => q - p), ratio = (a + .05) / (b + .05);
-    if (ratio < 4.5) found.push(`${one.tagName} "${one.textContent.slice(0, 30)}" ${ratio.toFixed(2)}`);
-  }
-  return [...new Set(found)];
-})()"""
 
 DRAWN = "[...document.querySelectorAll('[data-chart]')].every((host) => host.querySelector('svg'))"
 

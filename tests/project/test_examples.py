@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-FOLDER = Path(__file__).parent.parent / "examples"
+FOLDER = Path(__file__).parents[2] / "examples"
 SCRIPTS = {
     str(path.relative_to(FOLDER).with_suffix("")): path for path in FOLDER.rglob("*.py")
     if path.stem not in ("common", "drawing")

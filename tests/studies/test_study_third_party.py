@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-SOURCE = Path(__file__).parent / "third_party"
+SOURCE = Path(__file__).parents[1] / "third_party"
 STUDY = """
 name = "third party"
 solvers = ["predictor_corrector", "clarabel", "gauss_newton"]
