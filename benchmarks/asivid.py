@@ -40,13 +40,13 @@ def markov(a, c, b, count=10):
 
 def pole_distance(model) -> float:
     """Distance of the eigenvalues of A, the linear part of the feedback back in g, from the true ones."""
-    found, true = np.linalg.eigvals(model.injected(-model.L).A), np.linalg.eigvals(EXAMPLE1.a)
+    found, true = np.linalg.eigvals(model.inject_output(-model.L).A), np.linalg.eigvals(EXAMPLE1.a)
     return float(max(np.min(np.abs(true - z)) for z in found))
 
 
 def feedback_error(model) -> float:
     """Relative error of the Markov parameters of the orthogonalised feedback, whatever the gauge, in %."""
-    model = model.injected(-model.L)
+    model = model.inject_output(-model.L)
     found, true = [], []
     for j, own in enumerate(model.feedback):
         found.append(markov(model.A, model.C, model.E[:, [j]]) * own.mu[0])

@@ -130,7 +130,7 @@ def record(cell: Cell, samples: int, seed: int, noisy: bool = True) -> optid.Dat
             clean = np.asarray(model.simulate(u))
             return optid.Data(u, clean + noisy * 0.1 * clean.std(axis=0) * rng.normal(size=clean.shape))
         x, y = np.zeros(2), np.zeros((count, cell.outputs))
-        f = model.expanded(u)
+        f = model.expand_inputs(u)
         for k in range(count):  # what is fed back is measured, noise and all
             y[k] = model.C @ x + model.offset_y + noisy * 0.1 * rng.normal(size=cell.outputs)
             x = model.A @ x + model.B @ f[k] + model.E @ model.feedback[0](y[k, :1])

@@ -36,7 +36,7 @@ def regressor(data: optid.Data, na: int, nb: int, basis) -> tuple[np.ndarray, np
     u, y = data.u[:, 0], data.y[:, 0]
     first, n = max(na, nb - 1), len(y)
     past = np.column_stack([-y[first - i : n - i] for i in range(1, na + 1)] + [np.ones(n - first)])
-    eta = basis.fitted(float(u.min()), float(u.max())).values(u)
+    eta = basis.with_interval(float(u.min()), float(u.max())).values(u)
     return past, np.hstack([eta[first - j : n - j] for j in range(nb)]), y[first:]
 
 

@@ -41,7 +41,7 @@ def random_system(rng: np.random.Generator, n: int = 4) -> HammersteinSS:
     turn = np.linalg.qr(rng.normal(size=(n, n)))[0]
     functions = tuple(Nonlinearity(BASIS, np.array([1.0, *rng.uniform(-0.6, 0.6, 2)])) for _ in range(2))
     return HammersteinSS(turn @ A @ turn.T, rng.normal(size=(n, 2)), rng.normal(size=(2, n)),
-                         0.5 * rng.normal(size=(2, 2)), functions, offset_y=rng.normal(size=2)).balanced()
+                         0.5 * rng.normal(size=(2, 2)), functions, offset_y=rng.normal(size=2)).balance()
 
 
 def simulated(model: HammersteinSS, rng: np.random.Generator, count: int, process: float
@@ -51,7 +51,7 @@ def simulated(model: HammersteinSS, rng: np.random.Generator, count: int, proces
     clean = model.simulate(u)
     size = np.abs(clean - clean.mean(axis=0)).mean(axis=0)
     R = np.diag((0.1 * size) ** 2)
-    root = process * rng.normal(size=(model.nx, model.nx)) @ np.diag(np.std(model.expanded(u) @ model.B.T, axis=0))
+    root = process * rng.normal(size=(model.nx, model.nx)) @ np.diag(np.std(model.expand_inputs(u) @ model.B.T, axis=0))
     gain = kalman_gain(model.A, model.C, root @ root.T, R).K
     noisy = HammersteinSS(model.A, root, model.C, np.zeros((2, model.nx)), dt=model.dt)
     noise = noisy.simulate(rng.normal(size=(count, model.nx)))

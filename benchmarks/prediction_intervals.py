@@ -92,7 +92,7 @@ def states(model: HammersteinSS, root: Array, sensor: float) -> Callable[[Any, i
     def simulate(rng: Any, n: int) -> tuple[Array, Array]:
         u = rng.uniform(-1, 1, (n + BEFORE, model.m))
         u[:BEFORE] = 0.0
-        drive, x, y = model.expanded(u) @ model.B.T, np.zeros(model.nx), np.zeros((len(u), model.l))
+        drive, x, y = model.expand_inputs(u) @ model.B.T, np.zeros(model.nx), np.zeros((len(u), model.l))
         for k in range(len(u)):
             y[k] = model.C @ x
             back = np.array([g(y[k, o]) for g, o in zip(model.feedback, model.output_of)])

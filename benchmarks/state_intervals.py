@@ -84,7 +84,7 @@ def record(name: str, seed: int) -> optid.Data:
     u = np.random.default_rng(0).uniform(-1, 1, (SAMPLES, model.m))
     rng = np.random.default_rng([seed, 11])
     x, y = np.zeros(model.nx), np.zeros((SAMPLES, model.l))
-    f, root = model.expanded(u), process if process.ndim == 2 else np.diag(process)
+    f, root = model.expand_inputs(u), process if process.ndim == 2 else np.diag(process)
     for k in range(SAMPLES):
         y[k] = model.C @ x
         g = np.array([h(y[k, o]) for h, o in zip(model.feedback, model.output_of)])

@@ -60,7 +60,7 @@ def model(n: int, m: int, l: int, latent: int, samples: int) -> tuple[StateError
         0.02 * rng.normal(size=(l, latent)), 0.2 * rng.normal(size=(latent, n)), 0.1 * rng.normal(size=(latent, m)),
         np.zeros(latent))
     errors = StateErrors(optid.Data(u, rng.normal(size=(samples, l))), unknowns, np.eye(l))
-    x = errors.normalised(unknowns.pack(point))
+    x = errors.normalise(unknowns.pack(point))
     y = np.asarray(errors.at(unknowns.unpack(x)).simulate(errors.data, x0=np.zeros(n)))
     record = optid.Data(u, y + 0.01 * y.std() * rng.normal(size=y.shape))
     return replace(errors, data=record), x * (1 + 0.01 * rng.normal(size=x.size))

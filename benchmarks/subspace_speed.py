@@ -53,7 +53,7 @@ def expanded_record(count: int, basis: str) -> tuple[np.ndarray, object]:
     u = rng.uniform(-1, 1, (count, 2))
     f = np.column_stack([u[:, 0] ** 3 + u[:, 0], np.tanh(3 * u[:, 1])])
     _, y, _ = dlsim((A, B, C, np.zeros((2, 2)), 1), f)
-    family = (Polynomial(10) if basis == "polynomial" else Triangular(10)).fitted(-1.0, 1.0)
+    family = (Polynomial(10) if basis == "polynomial" else Triangular(10)).with_interval(-1.0, 1.0)
     record = np.hstack([u, y + 0.1 * rng.standard_normal((count, 2))])
     return record, expand(Data(u, record[:, 2:]), family)
 

@@ -79,7 +79,7 @@ def measure(route: str, samples: int) -> dict[str, float]:
     from optid.statistics import Layout, collect
 
     data = record(samples)
-    basis = optid.Triangular(CELLS).fitted(-1, 1)
+    basis = optid.Triangular(CELLS).with_interval(-1, 1)
     layout = Layout(na=NA, nb=(NB,), nk=(0,), bases=(basis,), outputs=data.outputs, inputs=data.inputs)
     n = layout.n_columns
     root = None

@@ -108,7 +108,7 @@ def measure(path: Path, work: str, threads: int, cells: int, lags: int) -> dict[
 
     names = ["u", "y"] if path.suffix == ".npy" else None
     stream = optid.open_stream(path, inputs=["u"], outputs=["y"], columns=names)
-    basis = optid.Triangular(cells).fitted(-1, 1)
+    basis = optid.Triangular(cells).with_interval(-1, 1)
     layout = Layout(na=NA, nb=(lags,), nk=(0,), bases=(basis,), outputs=stream.outputs, inputs=stream.inputs)
     rng = np.random.default_rng(0)
     collect(optid.Data(u=rng.uniform(-1, 1, 50_000), y=rng.standard_normal(50_000)), layout)  # compiles

@@ -19,7 +19,7 @@ from browser import Browser  # noqa: E402
 
 from optid.examples import example  # noqa: E402
 from optid.workbench.bench import BenchSource  # noqa: E402
-from optid.workbench.request import suggested  # noqa: E402
+from optid.workbench.request import suggest_state  # noqa: E402
 from optid.workbench.server import Server  # noqa: E402
 
 GESTURES = (("static", "Corridor", (0.4, 0.55), (0.6, 0.7)), ("static", "Point", (0.8, 0.4), (0.8, 0.45)),
@@ -29,7 +29,7 @@ GESTURES = (("static", "Corridor", (0.4, 0.55), (0.6, 0.7)), ("static", "Point",
 def main(samples: int = 100_000, moves: int = 12) -> None:
     warnings.simplefilter("ignore")
     chosen = example("thruster", n=samples)
-    server = Server(BenchSource(chosen.data, "", suggested(chosen.data, chosen.suggestion)))
+    server = Server(BenchSource(chosen.data, "", suggest_state(chosen.data, chosen.suggestion)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with tempfile.TemporaryDirectory() as profile, Browser(Path(profile)) as browser:
         browser.window(1300, 900)

@@ -77,11 +77,11 @@ def write_commands(folder: Path) -> None:
 def write_formulations(folder: Path) -> None:
     """Write the arguments and named variables of every formulation, from its signature and docstring."""
     from optid.descriptions import describe
-    from optid.registry import CONSTRAINTS, FORMULATIONS, registered
+    from optid.registry import CONSTRAINTS, FORMULATIONS, find_entry_points
 
     parts = ["# Formulations and constraints", "What `optid.fit(data, NAME, ...)` and `optid fit --formulation NAME` "
              "take. The programmes themselves are on the page [Mathematics](../mathematics.md)."]
-    for name, point in sorted(registered(FORMULATIONS).items()):
+    for name, point in sorted(find_entry_points(FORMULATIONS).items()):
         if point.module.split(".")[0] != "formulations":
             continue
         found = describe(point)
@@ -92,7 +92,7 @@ def write_formulations(folder: Path) -> None:
                   f"Source: `{point.module.replace('.', '/')}.py`. Constraints may name: "
                   + (", ".join(f"`{word}`" for word in found.variables) or "see the source") + "."]
     rows = "\n".join(f"| `{name}` | {_cell(describe(point).summary)} |" for name, point in
-                     sorted(registered(CONSTRAINTS).items()) if point.module.startswith("formulations."))
+                     sorted(find_entry_points(CONSTRAINTS).items()) if point.module.startswith("formulations."))
     parts += ["## Constraints", "As words (`--constraint monotone:increasing`, "
               "`constraints=[\"gain:1.0\"]`) or as functions of `formulations.constraints`.",
               f"| word | statement |\n|---|---|\n{rows}"]

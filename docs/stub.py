@@ -11,7 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import optid
 from optid.identify.fitting import fit
-from optid.registry import FORMULATIONS, registered
+from optid.registry import FORMULATIONS, find_entry_points
 
 STUB = Path(optid.__file__).with_suffix(".pyi")
 
@@ -61,7 +61,7 @@ def stub() -> str:
     common = parameters(fit, modules)
     overloads = []
     record = {hint: written(hint, modules) for hint in (get_type_hints(fit)["data"],)}.popitem()[1]
-    for name, point in sorted(registered(FORMULATIONS).items()):
+    for name, point in sorted(find_entry_points(FORMULATIONS).items()):
         if point.module.split(".")[0] != "formulations":  # those of other packages
             continue
         own = parameters(point.load(), modules)

@@ -77,7 +77,7 @@ def low_rank(structured: Structured, weight: float) -> Problem:
     misfit = matrix.misfit(weight)  # lambda ‖yhat - y‖²
 
     return Problem(
-        "low rank", matrix.start(), (matrix, misfit), (), structured.decomposed,
+        "low rank", matrix.start(), (matrix, misfit), (), structured.decompose,
         {"units": structured.windows.plan.units}, structured.in_units,
         scale=weight * float(np.sum(structured.problem.data**2)),
         weights={"weight": weight}, posed=partial(low_rank, structured))

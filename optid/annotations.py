@@ -7,7 +7,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 
-from optid.arrays import LARGEST_INTEGER, is_number, one_of, shown
+from optid.arrays import LARGEST_INTEGER, is_number, one_of, short_repr
 from optid.errors import StructureError
 
 PLAIN = bool | np.bool_ | int | float | complex | np.number | str | bytes | list | tuple | set | dict | None
@@ -23,7 +23,7 @@ def check_values(arguments: Mapping[str, Any], annotations: Mapping[str, Any]) -
     for name, value in arguments.items():
         kind = annotations.get(name, Any)
         if not _is_of(value, kind):
-            raise StructureError(f"{name}={shown(value)}: it must be {_described(kind)}.")
+            raise StructureError(f"{name}={short_repr(value)}: it must be {_described(kind)}.")
 
 
 def check_words(arguments: Mapping[str, Any], annotations: Mapping[str, Any]) -> None:

@@ -101,7 +101,7 @@ def largest(amounts: Iterable[tuple[float, str]]) -> tuple[float, str]:
     return found
 
 
-def frozen(array: np.ndarray) -> np.ndarray:
+def read_only(array: np.ndarray) -> np.ndarray:
     """Return an array, or a copy of it in C order, that cannot be written."""
     array = np.ascontiguousarray(array)
     array.flags.writeable = False
@@ -122,7 +122,7 @@ def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> 
                     "remove the fault that produced it.")
 
 
-def shown(value: Any) -> str:
+def short_repr(value: Any) -> str:
     """Return the value of an argument for a message, shortened; Python writes no integers of thousands of digits."""
     try:
         text = repr(value)
@@ -144,26 +144,26 @@ def check_integer(value: Any, name: str, low: int = 1, high: int | None = None,
         kind = {0: "a nonnegative integer", 1: "a positive integer"}.get(low, f"an integer of at least {low}")
         if high is not None or (isinstance(value, int) and value > top):
             kind = f"an integer from {low} to {top}"
-        raise error(f"{name} must be {kind}; got {shown(value)}.")
+        raise error(f"{name} must be {kind}; got {short_repr(value)}.")
     return int(value)
 
 
 def check_probability(value: Any, name: str) -> None:
     """Refuse an argument that is no probability strictly between 0 and 1 (`StructureError`)."""
     if not is_number(value) or not 0 < value < 1:
-        raise StructureError(f"{name}={shown(value)}: it must be a probability between 0 and 1.")
+        raise StructureError(f"{name}={short_repr(value)}: it must be a probability between 0 and 1.")
 
 
 def check_weight(value: Any, name: str) -> None:
     """Refuse the weight of a penalty that is not a nonnegative number (`StructureError`)."""
     if not is_number(value) or not 0 <= value <= LARGEST or value == np.inf:  # in float32 LARGEST is infinite
-        raise StructureError(f"{name}={shown(value)}: it must be a nonnegative number.")
+        raise StructureError(f"{name}={short_repr(value)}: it must be a nonnegative number.")
 
 
 def one_of(name: str, value: Any, known: Sequence[str]) -> None:
     """Refuse a word that is not known (`StructureError`)."""
     if not isinstance(value, str) or value not in known:
-        raise StructureError(f"{name}={shown(value)}: use one of {', '.join(known)}.")
+        raise StructureError(f"{name}={short_repr(value)}: use one of {', '.join(known)}.")
 
 
 def finite(values: Any, name: str, largest: float = LARGEST) -> np.ndarray:

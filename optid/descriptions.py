@@ -13,7 +13,7 @@ from typing import Any
 
 _AS_IN = re.compile(r"[Aa]s in `(\w+)`")
 _SHARED = re.compile(r"[Aa]rguments as in\s+`(?:([\w.]+)\.)?(\w+)`")
-_TRANSPARENT = {"recorded", "steps", "subspace_steps"}  # decorators that keep signature and docstring
+_TRANSPARENT = {"record_arguments", "steps", "subspace_steps"}  # decorators that keep signature and docstring
 _NAMED = re.compile(r"Named variables: ([^.]*)\.")
 
 

@@ -21,7 +21,7 @@ _NOUNS = {FORMULATIONS: "formulation", CONSTRAINTS: "constraint", FAULTS: "progr
 
 
 @cache
-def registered(group: str) -> dict[str, EntryPoint]:
+def find_entry_points(group: str) -> dict[str, EntryPoint]:
     """Return the entry points of a group by name."""
     return {point.name: point for point in entry_points(group=group)}
 
@@ -39,7 +39,7 @@ def entry_point(group: str, name: str) -> EntryPoint:
     Raises:
         LookupFailed: no such name; the message has the nearest one.
     """
-    known = registered(group)
+    known = find_entry_points(group)
     if not isinstance(name, str) or name not in known:
         raise LookupFailed(f"no {_NOUNS[group]} is called {name!r}. {nearest(str(name), known)}")
     return known[name]
@@ -80,7 +80,7 @@ def render(result: Any, form: str = "text", *arguments: Any, **options: Any) -> 
     Raises:
         LookupFailed: the result has no such form; the message lists those that it has.
     """
-    kind, known = type(result).__name__, registered(RENDERERS)
+    kind, known = type(result).__name__, find_entry_points(RENDERERS)
     name = f"{kind}.{form}"
     if form == "html" and name not in known:
         return f"<pre>{escape(render(result))}</pre>"

@@ -58,7 +58,7 @@ def controlled(model: HammersteinSS, faults: list[Fault | None], load: np.ndarra
             wanted = (PROPORTIONAL * error + INTEGRAL * (total + error)) @ gain.T
             u[:, k] = np.clip(wanted, -REACH, REACH)
             total += np.where(np.all(np.abs(wanted) < REACH, axis=1)[:, None], error, 0.0)  # no windup
-        f = model.expanded(u[:, k])
+        f = model.expand_inputs(u[:, k])
         x = x + to_state[:, k]
         y[:, k] = x @ model.C.T + (kept[:, k] * f) @ model.D.T + to_output[:, k] + v[:, k]
         x = x @ model.A.T + (kept[:, k + 1] * f) @ model.B.T + w[:, k]

@@ -26,7 +26,7 @@ SHOWN = {7: ("0 %", "-"), 10: ("25 %", "3.0"), 20: ("100 %", "1.5"), 30: ("100 %
 def by_hand(model, u, y, proof, process, output):
     """Add up the proof from the matrices of the model alone: sum and what it may be at most."""
     p, q = proof.weights, np.zeros(model.nx)
-    f = model.expanded(u)
+    f = model.expand_inputs(u)
     x, total = np.zeros(model.nx), 0.0
     for k in range(len(y)):
         total += p[k] @ (y[k] - model.C @ x - model.D @ f[k] - model.offset_y)
@@ -40,7 +40,7 @@ def by_hand(model, u, y, proof, process, output):
 
 def bounded(model, u, rng, process, output):
     """A record whose noise keeps its bounds."""
-    f, x, y = model.expanded(u), np.zeros(model.nx), np.empty((len(u), model.l))
+    f, x, y = model.expand_inputs(u), np.zeros(model.nx), np.empty((len(u), model.l))
     for k in range(len(u)):
         y[k] = model.C @ x + model.D @ f[k] + model.offset_y + output * rng.uniform(-1, 1, model.l)
         x = model.A @ x + model.B @ f[k] + model.offset_x + process * rng.uniform(-1, 1, model.nx)

@@ -61,7 +61,7 @@ def record(plant: HammersteinSS, damaged: HammersteinSS, count: int, seed: int) 
     """Return healthy samples followed by `count` samples of the damaged plant."""
     u = levels(BEFORE + count, 1000 + seed)
     before = trajectory(plant, u[: BEFORE + 1], seed=seed)
-    last = [model.expanded(u[BEFORE - 1 : BEFORE])[0] for model in (plant, damaged)]
+    last = [model.expand_inputs(u[BEFORE - 1 : BEFORE])[0] for model in (plant, damaged)]
     after = trajectory(damaged, u[BEFORE:], seed=50_000 + seed, x0=before.x[-1] + plant.B @ (last[1] - last[0]))
     return Data(u, np.vstack([before.y[:BEFORE], after.y]))
 
@@ -94,12 +94,12 @@ def off_by(plant: HammersteinSS, percent: float, seed: int) -> HammersteinSS:
 def levenberg_marquardt(problem: Refitting, steps: int = 60) -> np.ndarray:
     """Return the least squares of the innovations, with nothing believed beforehand."""
     theta, damping = problem.start, 1e-2
-    r, s = problem.linearised(theta)
+    r, s = problem.linearise(theta)
     for _ in range(steps):
         scale = np.sqrt(np.sum(s**2, axis=0)) + 1e-9
         rows = np.vstack([s, np.sqrt(damping) * np.diag(scale)])
         trial = theta + np.linalg.lstsq(rows, np.concatenate([-r, np.zeros(theta.size)]), rcond=None)[0]
-        r_trial, s_trial = problem.linearised(trial)
+        r_trial, s_trial = problem.linearise(trial)
         if np.sum(r_trial**2) < np.sum(r**2):
             settled = np.sum(r**2) - np.sum(r_trial**2) < 1e-8 * np.sum(r**2)
             theta, r, s, damping = trial, r_trial, s_trial, damping / 5

@@ -23,7 +23,7 @@ SAMPLES, SETTLED, LENGTHS, LAGS = 1500, 50, (300, 1000, 4000), 8
 def tracked(model, healthy: Data, seen: Data, lost: int) -> np.ndarray:
     """Fill in a lost output from a basis tracked over [y; f(u)] of 8 lags."""
     def stacked(data: Data) -> np.ndarray:
-        signal = np.hstack([data.y, model.expanded(data.u)])
+        signal = np.hstack([data.y, model.expand_inputs(data.u)])
         return np.hstack([signal[LAGS - 1 - lag : len(signal) - lag] for lag in range(LAGS)])
 
     rows = stacked(healthy)
@@ -55,7 +55,7 @@ def main() -> None:
         for run in range(options.runs):
             u = levels(SAMPLES, 500 + run)
             told = trajectory(plant, u, seed=run, x0="rest")
-            clean = (told.x @ plant.C.T + plant.expanded(u) @ plant.D.T)[:, lost]
+            clean = (told.x @ plant.C.T + plant.expand_inputs(u) @ plant.D.T)[:, lost]
             record = Data(u, told.y)
             spread.append(np.var(clean[SETTLED:]))
             estimates = {"Kalman filter": filtered.estimate(record)[:, lost], "simulation": plant.simulate(

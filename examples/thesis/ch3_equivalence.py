@@ -8,7 +8,7 @@ python ch3_equivalence.py [folder for the figures]
 from pathlib import Path
 
 import numpy as np
-from common import BETA, bases, panels, recursion, run, save, styled, table
+from common import BETA, bases, panels, recursion, run, save, table, with_style
 
 from optid.examples import example
 
@@ -21,7 +21,7 @@ def ratio(top: np.ndarray, bottom: np.ndarray, signs: bool) -> np.ndarray:
     return sign * np.sqrt(top**2 + EPS**2) / np.sqrt(bottom**2 + EPS**2)
 
 
-@styled
+@with_style
 def main(folder: Path) -> dict[str, float]:
     """Return the medians of the ratios over the last 20 s in both readings, and the distance; save the curves."""
     data, u = example("dead_zone", seed=0).data, np.linspace(-1, 1, 401)

@@ -6,7 +6,7 @@ Run: python ch3_example.py [folder for the figures]
 from pathlib import Path
 
 import numpy as np
-from common import BETA, bases, last_error, panels, recursion, run, save, styled, table
+from common import BETA, bases, last_error, panels, recursion, run, save, table, with_style
 
 import optid
 from optid.examples import example
@@ -14,7 +14,7 @@ from optid.examples import example
 RECORDS = 40
 
 
-@styled
+@with_style
 def main(folder: Path) -> dict[str, float]:
     """Return a, b, s_2/s_1 and E_200 of both bases; save the last 8 s and the nonlinearities."""
     record, found = example("dead_zone", seed=0), {}

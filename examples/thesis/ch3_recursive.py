@@ -6,12 +6,12 @@ Run: python ch3_recursive.py [folder for the figures]
 from pathlib import Path
 
 import numpy as np
-from common import BETA, bases, panels, recursion, run, save, styled, table
+from common import BETA, bases, panels, recursion, run, save, table, with_style
 
 from optid.examples import example
 
 
-@styled
+@with_style
 def main(folder: Path) -> dict[str, float]:
     """Return the last estimates of both bases and when they stay within 5 %; save the traces."""
     record, found = example("dead_zone", seed=0), {}

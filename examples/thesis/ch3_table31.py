@@ -7,14 +7,14 @@ python ch3_table31.py [folder for the figures]
 from pathlib import Path
 
 import numpy as np
-from common import BETA, bases, panels, recursion, run, save, styled
+from common import BETA, bases, panels, recursion, run, save, with_style
 
 from optid.examples import example
 
 LENGTHS = (1000, 10_000, 100_000)
 
 
-@styled
+@with_style
 def main(folder: Path) -> dict[str, float]:
     """Return the largest cosine and sine errors for every record length; save the coefficients."""
     basis, found = bases(-1, 1)["trigonometric"], {}

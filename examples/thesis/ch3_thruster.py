@@ -7,13 +7,13 @@ python ch3_thruster.py [folder for the figures]
 from pathlib import Path
 
 import numpy as np
-from common import bases, panels, recursion, run, save, styled, table
+from common import bases, panels, recursion, run, save, table, with_style
 
 import optid
 from optid.examples import example
 
 
-@styled
+@with_style
 def main(folder: Path) -> dict[str, float]:
     """Return a, b_0, output error and error of f of both bases; save output, nonlinearity and traces."""
     record, found = example("thruster", seed=0), {}

@@ -28,7 +28,7 @@ FEEDBACK = [optid.UserFunctions((lambda y: -np.sin(y),), ("sine",), **BEYOND),
 def true_model(test: optid.Data) -> optid.HammersteinSS:
     """The plant; its error with the measured outputs in the feedback is the noise floor."""
     p, mus = plants.EXAMPLE1, ([1, 0.5], [1], [1], [1])
-    functions = [optid.Nonlinearity(b.fitted(-20, 20), np.array(mu)) for b, mu in zip(BASIS + FEEDBACK, mus)]
+    functions = [optid.Nonlinearity(b.with_interval(-20, 20), np.array(mu)) for b, mu in zip(BASIS + FEEDBACK, mus)]
     return optid.HammersteinSS(p.a, p.b, p.c, p.d, E=p.e, output_of=(0, 1), nonlinearities=tuple(functions[:2]),
                                feedback=tuple(functions[2:]), inputs=test.inputs, outputs=test.outputs)
 

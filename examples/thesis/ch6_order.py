@@ -7,7 +7,7 @@ Figures 6.2 and 6.3 (expected threshold against N) are the right panel. python c
 from pathlib import Path
 
 import numpy as np
-from common import panels, run, save, styled
+from common import panels, run, save, with_style
 
 from optid.bases import Linear
 from optid.identify.order import RankTest, order_test
@@ -24,7 +24,7 @@ def tested(case: str, n: int, seed: int) -> RankTest:
     return order_test([np.hstack([data.u, data.y])], expand(data, Linear()), ROWS)
 
 
-@styled
+@with_style
 def main(folder: Path) -> dict[str, float]:
     """Return the shares of correct orders; save singular values and thresholds."""
     found, shown = {}, {case: tested(case, 1000, 0) for case in ("deterministic", "combined")}

@@ -7,7 +7,7 @@ only access to a mode; past outputs among the instruments hide an actuator. pyth
 from pathlib import Path
 
 import numpy as np
-from common import panels, run, save, styled
+from common import panels, run, save, with_style
 
 from optid import Data
 from optid.faults import Fault, HardOver, hard_over_test, inject
@@ -23,7 +23,7 @@ def judged(plant: str, noise: float, fault: str | None, seed: int, at: int = 0, 
     return hard_over_test(Data(u[N:], y[N:]), Data(u[:N], y[:N]), window=N, **settings)
 
 
-@styled
+@with_style
 def main(folder: Path) -> dict[str, float]:
     """Return usual orders and range of the statistics; save those of a sliding window."""
     found = {}

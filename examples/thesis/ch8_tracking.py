@@ -7,7 +7,7 @@ subspace is stationary, all but the dominant one are saddles. python ch8_trackin
 from pathlib import Path
 
 import numpy as np
-from common import panels, run, save, styled, table
+from common import panels, run, save, table, with_style
 
 from optid import tracking as tr
 
@@ -15,7 +15,7 @@ VALUES, N, LOSS, STEP, LOST = np.array([5, 3, 1, 0.5, 0.3, 0.1]), 8000, 4000, 50
 LOSSES, CURVATURES = (1.9, 3.9, 4.4, 5.9, 6.4, 8.4), (0, -4, -5, -8, -9, -9)
 
 
-@styled
+@with_style
 def main(folder: Path) -> dict[str, float]:
     """Return losses, curvatures and errors; save the angles of both trackers through the loss of a sensor."""
     rng = np.random.default_rng(8)

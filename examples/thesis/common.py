@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 import optid
 from optid.identify.design.rules import check_lines
-from optid.show.panels import styled as styled
+from optid.show.panels import with_style as with_style
 from optid.statistics.expansion import expand
 
 SERIES = {"basis": "polynomial:4", "feedback_basis": "polynomial:4"}

@@ -15,7 +15,7 @@ from scipy.signal import welch
 
 import optid
 from optid.plants import ReactionWheelPendulum
-from optid.show.panels import BLUE, GREEN, INK, MUTED, ORANGE, styled, with_unit
+from optid.show.panels import BLUE, GREEN, INK, MUTED, ORANGE, with_style, with_unit
 
 Cases = Sequence[tuple[str, optid.Data, dict[str, Any]]]
 
@@ -35,7 +35,7 @@ def onto(truth: np.ndarray, *parts: np.ndarray) -> np.ndarray:
     return table @ np.linalg.lstsq(table, truth, rcond=None)[0]
 
 
-@styled
+@with_style
 def draw_record(folder: Path, number: str, name: str, title: str, data: optid.Data, time: str = "time (s)") -> None:
     """Save the inputs of a record above its outputs."""
     channels = zip(data.inputs + data.outputs, data.input_units + data.output_units, np.hstack([data.u, data.y]).T)
@@ -47,7 +47,7 @@ def draw_record(folder: Path, number: str, name: str, title: str, data: optid.Da
     save_numbered(figure, folder, number, name, title)
 
 
-@styled
+@with_style
 def draw_responses(folder: Path, number: str, name: str, title: str, cases: Cases, samples: int,
                    time: str = "time (s)", more: Sequence[Callable[[Axes], None]] = ()) -> None:
     """Save the measured outputs and their simulations with measured feedback, with the errors beside.
@@ -81,7 +81,7 @@ def draw_responses(folder: Path, number: str, name: str, title: str, cases: Case
     save_numbered(figure, folder, number, name, title)
 
 
-@styled
+@with_style
 def draw_functions(folder: Path, number: str, name: str, title: str, models: dict[str, Any],
                    f: Callable[[np.ndarray], np.ndarray], g: Callable[[np.ndarray], np.ndarray]) -> None:
     """Save f and g of models with one input and output beside the truth; their gauge is that of the truth."""
@@ -105,7 +105,7 @@ def draw_function(axis: Axes, x_label: str, y_label: str, x: np.ndarray, truth: 
     axis.legend(loc="upper center", ncols=3)
 
 
-@styled
+@with_style
 def draw_times(folder: Path, number: str, name: str, title: str, lengths: Sequence[int], times: np.ndarray) -> None:
     """Save the times (2, lengths) in ms of SIVID and ASIVID against the lengths of the records."""
     figure, ((axis,),) = panels(1, 1, (5.6, 3.6))
@@ -117,7 +117,7 @@ def draw_times(folder: Path, number: str, name: str, title: str, lengths: Sequen
     save_numbered(figure, folder, number, name, title)
 
 
-@styled
+@with_style
 def draw_orders(folder: Path, number: str, name: str, title: str, cases: dict[str, dict[str, optid.Fit]]) -> None:
     """Save the singular values of the projections of SID and ASIVID, one line per case."""
     figure, axes = panels(1, 2)
@@ -137,7 +137,7 @@ def draw_singular_values(axis: Axes, title: str, fits: dict[str, optid.Fit],
     axis.legend()
 
 
-@styled
+@with_style
 def draw_excitations(folder: Path, number: str, experiment: int, records: dict[str, optid.Data]) -> None:
     """Save the commands of an experiment, their spectra and the outputs, divided by their root mean squares."""
     records = {name[2:]: data for name, data in records.items() if name.startswith(str(experiment))}
@@ -157,7 +157,7 @@ def draw_excitations(folder: Path, number: str, experiment: int, records: dict[s
     save_numbered(figure, folder, number, f"experiment_{experiment}_inputs", f"experiment {experiment}: inputs")
 
 
-@styled
+@with_style
 def draw_frequency_response(folder: Path, number: str, title: str, data: optid.Data) -> None:
     """Save the measured frequency response of every output to the first input up to 5 Hz, and its coherence."""
     found = optid.frequency_response(data)

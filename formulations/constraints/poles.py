@@ -26,9 +26,9 @@ import cvxpy as cp
 import numpy as np
 from scipy.optimize import root_scalar
 
-from formulations.constraints.rule import Rule, check_bounds, recorded
+from formulations.constraints.rule import Rule, check_bounds, record_arguments
 from optid.errors import StructureError
-from optid.models.roots import pulled, roots_of
+from optid.models.roots import pull_roots, roots_of
 from optid.models.roots import radius as root_radius
 from optid.program.limits import Limit
 from optid.program.view import View
@@ -143,7 +143,7 @@ def disc_region(radius: float, centre: float = 0.0) -> Region:
     return Region(radius, "the radius", lambda r: [disc_side(r, centre)])
 
 
-@recorded
+@record_arguments
 def disc(centre: float, radius: float) -> Rule:
     """All poles lie in the disc of a given radius around a point of the real axis.
 
@@ -171,7 +171,7 @@ def disc(centre: float, radius: float) -> Rule:
     return replace(rule, build=build)
 
 
-@recorded
+@record_arguments
 def strip(low: float | None = None, high: float | None = None) -> Rule:
     """The real part of every pole lies in [low, high].
 
@@ -187,7 +187,7 @@ def strip(low: float | None = None, high: float | None = None) -> Rule:
     return region_rule(f"strip:{','.join(ends)}", regions, f"the strip {ends[0]} <= Re z <= {ends[1]}")
 
 
-@recorded
+@record_arguments
 def sector(angle: float) -> Rule:
     """Every pole has an argument of at most ``angle`` radians: no oscillation above angle / dt rad per second.
 
@@ -200,7 +200,7 @@ def sector(angle: float) -> Rule:
     return region_rule(f"sector:{angle:g}", [region], f"the sector |arg z| <= {angle:g}")
 
 
-@recorded
+@record_arguments
 def damped(ratio: float) -> Rule:
     """Every pole has at least a given damping ratio.
 
@@ -234,7 +234,7 @@ def damping_sides(rate: float) -> list[Side]:
     return sides
 
 
-@recorded
+@record_arguments
 def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> Rule:
     """All poles lie in the disc of a given radius; optionally real and separated by given points.
 
@@ -272,7 +272,7 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
             return _triangle(a[0], a[1], region)
         reference = np.asarray(view.reference.get("a", np.zeros(na)), dtype=float)
         rows, levels, centre = inner_region(reference, radius, keep=view.iterate)
-        grid = frequencies(roots_of(scaled(centre, radius)))
+        grid = frequencies(roots_of(scale_roots(centre, radius)))
         wider, narrower = ((1 + sign * NEARBY) * radius for sign in (1, -1))
         (above, high), (below, low) = (_positive_real(centre * (near / radius) ** np.arange(1, na + 1), near, grid)
                                        for near in (wider, narrower))
@@ -306,7 +306,7 @@ def refuse_integrator(constraints: Sequence[Any], remedy: str) -> None:
         raise StructureError(remedy)
 
 
-@recorded
+@record_arguments
 def integrator() -> Rule:
     """A pole lies at 1, ``1 + a_1 + ... + a_na = 0``: the output ramps while the inputs are held.
 
@@ -354,14 +354,14 @@ def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False
     whole = np.asarray(reference, dtype=float)
     inside = root_radius(whole) < radius
     for limit in LIMITS if keep and inside else LIMITS[:1]:
-        centre = pulled(whole, limit * radius)
+        centre = pull_roots(whole, limit * radius)
         rows, levels = _positive_real(centre, radius)
         if not (keep and inside) or np.all(rows @ whole >= levels):
             return rows, levels, centre
     return *_positive_real(whole, radius), whole
 
 
-def scaled(a: np.ndarray, radius: float) -> np.ndarray:
+def scale_roots(a: np.ndarray, radius: float) -> np.ndarray:
     """Return the coefficients of the polynomial whose roots are those of A divided by a radius."""
     return a * radius ** -np.arange(1.0, a.size + 1)
 
@@ -370,9 +370,9 @@ def _positive_real(centre: np.ndarray, radius: float, grid: np.ndarray | None = 
     """Return the inequalities Re(A / C) >= `GAP` on a grid of the circle."""
     order = np.arange(1, centre.size + 1)
     powers = radius ** -order.astype(float)
-    where = frequencies(roots_of(scaled(centre, radius))) if grid is None else grid
+    where = frequencies(roots_of(scale_roots(centre, radius))) if grid is None else grid
     lags = np.exp(-1j * where)[:, None] ** order
-    values = 1 + lags @ scaled(centre, radius)
+    values = 1 + lags @ scale_roots(centre, radius)
     size = np.abs(values) ** 2
     rows = np.real(np.conj(values)[:, None] * lags * powers) / size[:, None]
     levels = GAP - np.real(values) / size

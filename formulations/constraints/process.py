@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from formulations.constraints.rule import Rule, check_bounds, label, recorded
+from formulations.constraints.rule import Rule, check_bounds, label, record_arguments
 from optid.errors import StructureError
 from optid.program.limits import Limit
 from optid.program.view import View
@@ -21,7 +21,7 @@ __all__ = ["K", "T", "dead_time", "overdamped", "tau", "tau_zero", "zeta"]
 Pair = tuple[str | None, str | None]  # names of input and output
 
 
-@recorded
+@record_arguments
 def tau(value: float | None = None, low: float | None = None, high: float | None = None, number: float | None = None,
         channel: str | None = None, output: str | None = None) -> Rule:
     """The time constants equal ``value`` or lie in [low, high], in units of time; all, or the one of a number from 1.
@@ -51,21 +51,21 @@ def tau(value: float | None = None, low: float | None = None, high: float | None
     return Rule(label(f"tau{own}", *pair), build)
 
 
-@recorded
+@record_arguments
 def T(value: float | None = None, low: float | None = None, high: float | None = None,  # noqa: N802
       channel: str | None = None, output: str | None = None) -> Rule:
     """The time constant of the second-order factor equals ``value`` or lies in [low, high]; errors as of `tau`."""
     return _bounded("T", ("T",), value, low, high, (channel, output))
 
 
-@recorded
+@record_arguments
 def zeta(value: float | None = None, low: float | None = None, high: float | None = None, channel: str | None = None,
          output: str | None = None) -> Rule:
     """The damping of the second-order factor equals ``value`` or lies in [low, high]; errors as of `tau`."""
     return _bounded("zeta", ("zeta",), value, low, high, (channel, output))
 
 
-@recorded
+@record_arguments
 def overdamped(channel: str | None = None, output: str | None = None) -> Rule:
     """The damping of the second-order factor is at least one: its poles are real."""
 
@@ -75,7 +75,7 @@ def overdamped(channel: str | None = None, output: str | None = None) -> Rule:
     return Rule(label("overdamped", channel, output), build)
 
 
-@recorded
+@record_arguments
 def tau_zero(value: float | None = None, low: float | None = None, high: float | None = None,
              channel: str | None = None, output: str | None = None) -> Rule:
     """The time constant of the zero equals ``value`` or lies in [low, high]; negative with an inverse response.
@@ -86,7 +86,7 @@ def tau_zero(value: float | None = None, low: float | None = None, high: float |
     return _linear("tau_zero", value, low, high, (channel, output))
 
 
-@recorded
+@record_arguments
 def dead_time(value: float | None = None, low: float | None = None, high: float | None = None,
               channel: str | None = None, output: str | None = None) -> Rule:
     """The dead time equals ``value`` or lies in [low, high], in units of time.
@@ -98,7 +98,7 @@ def dead_time(value: float | None = None, low: float | None = None, high: float 
     return _linear("dead_time", value, low, high, (channel, output))
 
 
-@recorded
+@record_arguments
 def K(value: float | None = None, low: float | None = None, high: float | None = None,  # noqa: N802
       channel: str | None = None, output: str | None = None) -> Rule:
     """The gain equals ``value`` or lies in [low, high]; with an integrator, the slope of the output.

@@ -13,7 +13,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.linalg import toeplitz
 
-from formulations.constraints.rule import Rule, check_bounds, label, recorded, sign_of
+from formulations.constraints.rule import Rule, check_bounds, label, record_arguments, sign_of
 from formulations.constraints.shape import slopes_at
 from optid.errors import StructureError
 from optid.program.limits import Limit
@@ -26,7 +26,7 @@ HORIZON = 50  # samples over which the sign of a response is imposed
 REAL = 1e-9  # least eigenvalue in the inequality of positive realness, relative to the size of C
 
 
-@recorded
+@record_arguments
 def impulse_response(sign: str = "positive", horizon: float = HORIZON, at: float | None = None,
                      channel: str | None = None, output: str | None = None) -> Rule:
     """The response to a small impulse at an operating point has one sign.
@@ -43,7 +43,7 @@ def impulse_response(sign: str = "positive", horizon: float = HORIZON, at: float
                      summed=False)
 
 
-@recorded
+@record_arguments
 def step_response(sign: str = "positive", horizon: float = HORIZON, low: float | None = None,
                   high: float | None = None, channel: str | None = None, output: str | None = None) -> Rule:
     """The response to a step of the input from ``low`` up to ``high`` has one sign at every sample: no undershoot.
@@ -55,7 +55,7 @@ def step_response(sign: str = "positive", horizon: float = HORIZON, low: float |
                      summed=True)
 
 
-@recorded
+@record_arguments
 def step_band(low: float | None = None, high: float | None = None, first: float = 0, last: float = HORIZON,
               channel: str | None = None, output: str | None = None, around: Any = None) -> Rule:
     """The response to a step of the input over the interval of its basis lies in [low, high] from sample first to last.
@@ -124,7 +124,7 @@ def step_band(low: float | None = None, high: float | None = None, first: float 
     return Rule(name, build, verify, stand_in=stand_in)
 
 
-@recorded
+@record_arguments
 def no_effect(channel: str, output: str | None = None) -> Rule:
     """An input acts on no output, or not on a given one: its column of the transfer matrix is zero there."""
 
@@ -142,7 +142,7 @@ def no_effect(channel: str, output: str | None = None) -> Rule:
     return Rule(f"no_effect:{channel}" + ("" if output is None else f",{output}"), build)
 
 
-@recorded
+@record_arguments
 def positive_real(margin: float = 0.0) -> Rule:
     """The transfer matrix is positive real: ``G + G* >= 2 margin`` on and outside the unit circle.
 

@@ -9,7 +9,7 @@ from typing import Any, ParamSpec
 import numpy as np
 
 from optid.errors import StructureError
-from optid.program.limits import named
+from optid.program.limits import name_limits
 from optid.program.view import View
 
 P = ParamSpec("P")
@@ -51,14 +51,14 @@ class Rule:
 
     def members(self, view: View) -> list[Any]:
         """Return its CVXPY constraints alone."""
-        return [limit.member for limits in named(self(view), "").values() for limit in limits]
+        return [limit.member for limits in name_limits(self(view), "").values() for limit in limits]
 
-    def named(self, name: str) -> "Rule":
+    def with_name(self, name: str) -> "Rule":
         """Return the same constraint under another name, for two of a kind."""
         return replace(self, name=name)
 
 
-def recorded(function: Callable[P, Rule]) -> Callable[P, Rule]:
+def record_arguments(function: Callable[P, Rule]) -> Callable[P, Rule]:
     """Let the rules of a function remember its arguments, so that they can be pickled."""
 
     @wraps(function)
@@ -69,7 +69,7 @@ def recorded(function: Callable[P, Rule]) -> Callable[P, Rule]:
 
 
 def _built_again(module: str, function: str, args: tuple[Any, ...], kwargs: Mapping[str, Any], name: str) -> Rule:
-    return getattr(import_module(module), function)(*args, **kwargs).named(name)
+    return getattr(import_module(module), function)(*args, **kwargs).with_name(name)
 
 
 def label(word: str, *names: str | None) -> str:

@@ -28,7 +28,7 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.constraints.poles import stable
-from formulations.constraints.rule import Rule, check_bounds, label, recorded, sign_of
+from formulations.constraints.rule import Rule, check_bounds, label, record_arguments, sign_of
 from optid.bases import PiecewiseConstant
 from optid.errors import StructureError
 from optid.program.limits import Limit
@@ -41,7 +41,7 @@ RANGE = "the range of f"  # what the price of a bound is quoted in 1 % of
 SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic; imposed with every rule about it
 
 
-@recorded
+@record_arguments
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
     """The nonlinearity, and the static characteristic with it, is "increasing" or "decreasing" over its interval.
 
@@ -55,7 +55,7 @@ def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
     return _cone("monotone", direction, channel, lambda basis: sign * basis.increments())
 
 
-@recorded
+@record_arguments
 def convex(channel: str | None = None) -> Rule:
     """The nonlinearity, and the static characteristic with it, is convex over the interval of its basis.
 
@@ -67,7 +67,7 @@ def convex(channel: str | None = None) -> Rule:
     return _cone("convex", "", channel, lambda basis: _smooth(basis, "convex").curvature(), heights=False)
 
 
-@recorded
+@record_arguments
 def concave(channel: str | None = None) -> Rule:
     """The nonlinearity, and the static characteristic with it, is concave over the interval of its basis.
 
@@ -76,7 +76,7 @@ def concave(channel: str | None = None) -> Rule:
     return _cone("concave", "", channel, lambda basis: -_smooth(basis, "concave").curvature(), heights=False)
 
 
-@recorded
+@record_arguments
 def odd(channel: str | None = None) -> Rule:
     """f(u) - f(0) is odd; the offset of the model stays free.
 
@@ -86,13 +86,13 @@ def odd(channel: str | None = None) -> Rule:
     return _linear("odd", channel, lambda basis: _mirror(basis, +1.0))
 
 
-@recorded
+@record_arguments
 def even(channel: str | None = None) -> Rule:
     """The nonlinearity is even, in the sense of `odd`."""
     return _linear("even", channel, lambda basis: _mirror(basis, -1.0))
 
 
-@recorded
+@record_arguments
 def dead_zone(low: float, high: float, channel: str | None = None) -> Rule:
     """The nonlinearity is constant on [low, high]; cells that the zone only touches become constant as a whole.
 
@@ -104,7 +104,7 @@ def dead_zone(low: float, high: float, channel: str | None = None) -> Rule:
     return _linear(f"dead_zone:{low:g},{high:g}", channel, lambda basis: _flat(basis, low, high))
 
 
-@recorded
+@record_arguments
 def saturation(low: float | None = None, high: float | None = None, channel: str | None = None) -> Rule:
     """The nonlinearity is constant below ``low`` and above ``high``.
 
@@ -125,7 +125,7 @@ def saturation(low: float | None = None, high: float | None = None, channel: str
     return _linear("saturation", channel, rows)
 
 
-@recorded
+@record_arguments
 def slope(low: float | None = None, high: float | None = None, channel: str | None = None,
           output: str | None = None) -> Rule:
     """The slope of the static characteristic lies in [low, high] (units of output per unit of input).
@@ -139,7 +139,7 @@ def slope(low: float | None = None, high: float | None = None, channel: str | No
                    offset=False)
 
 
-@recorded
+@record_arguments
 def value_range(low: float | None = None, high: float | None = None, channel: str | None = None,
                 output: str | None = None, first: float | None = None, last: float | None = None) -> Rule:
     """The static characteristic lies in [low, high] (units of the output) where the input lies in [first, last].
@@ -166,7 +166,7 @@ def value_range(low: float | None = None, high: float | None = None, channel: st
     return _static("range", low, high, channel, output, rows, offset=True)
 
 
-@recorded
+@record_arguments
 def through(u: float | Sequence[float], y: float | Sequence[float], channel: str | None = None,
             output: str | None = None) -> Rule:
     """The static characteristic passes through the points (u, y).
@@ -184,7 +184,7 @@ def through(u: float | Sequence[float], y: float | Sequence[float], channel: str
     return _static("through", ys, ys, channel, output, lambda basis: basis.values(us), offset=True)
 
 
-@recorded
+@record_arguments
 def gain(value: float | None = None, low: float | None = None, high: float | None = None, at: float | None = None,
          channel: str | None = None, output: str | None = None) -> Rule:
     """The static gain at an operating point equals ``value`` or lies in [low, high].
@@ -205,7 +205,7 @@ def gain(value: float | None = None, low: float | None = None, high: float | Non
     return _static("gain", low, high, channel, output, lambda basis: slopes_at(basis, at), offset=False)
 
 
-@recorded
+@record_arguments
 def coefficients(name: str, low: float | None = None, high: float | None = None, index: int | None = None) -> Rule:
     """Bounds on the entries of a named variable: ``a``, ``offset``, or ``b`` where its scale is fixed.
 
@@ -231,7 +231,7 @@ def coefficients(name: str, low: float | None = None, high: float | None = None,
     return Rule(f"coefficients:{name}", build)
 
 
-@recorded
+@record_arguments
 def fixed(name: str, value: Any) -> Rule:
     """A known parameter: ``a`` and ``offset`` by value, ``mu`` and ``b`` up to the factor between them.
 
@@ -261,7 +261,7 @@ def fixed(name: str, value: Any) -> Rule:
     return Rule(f"fixed:{name}", build)
 
 
-@recorded
+@record_arguments
 def shared(name: str, first: str, second: str) -> Rule:
     """Two inputs share ``b`` (the dynamics) or ``mu`` (the nonlinearity), each in the gauge of the formulation."""
 
@@ -272,7 +272,7 @@ def shared(name: str, first: str, second: str) -> Rule:
     return Rule(f"shared:{name}:{first},{second}", build)
 
 
-@recorded
+@record_arguments
 def sign(name: str = "b", direction: str = "positive") -> Rule:
     """All entries of a named variable have one sign; for ``b`` or ``mu`` this also fixes the sign of the other."""
     factor = sign_of("direction", direction, "positive", "negative")

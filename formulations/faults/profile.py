@@ -79,7 +79,7 @@ def _changing(prior: str, shares: Sequence[float], rules: Sequence[Any], fits: C
 def _refit(problem: CourseProblem, changes: Changes) -> Problem:
     """State the least squares of a course that changes at known samples."""
     return Problem(
-        f"fault.profile {changes.prior} refit", {"scaled": problem.refitted(changes.columns)[0]},
+        f"fault.profile {changes.prior} refit", {"scaled": problem.refit(changes.columns)[0]},
         (Squares.half(problem.r, {"scaled": changes.columns}),),
         further=lambda v, _: {"f": changes.courses @ v["scaled"], "changes": cp.multiply(changes.unit, v["scaled"])},
         scale=0.5 * float(problem.r @ problem.r))

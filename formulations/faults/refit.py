@@ -43,7 +43,7 @@ def actuator(problem: Refitting, *, constraints: Sequence[Any] | str = "default"
         problem: from `optid.faults.repair.refitting.refitting`.
         constraints: constraints on f or their words; "default": monotone, and nowhere steeper than before.
     """
-    r, s = problem.linearised(problem.start)
+    r, s = problem.linearise(problem.start)
     return _step("refit.actuator", problem, problem.start, r, s, constraints)
 
 
@@ -58,8 +58,8 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
         The model; its value of the objective is a local minimum.
     """
     z = np.append(problem.start, np.zeros(len(problem.curves)))
-    r, s = problem.linearised(problem.start)
-    (believed, wanted), objective = problem.believed(), np.inf
+    r, s = problem.linearise(problem.start)
+    (believed, wanted), objective = problem.prior_rows(), np.inf
     for _ in range(STEPS):
         solution = yield _step("refit.parameters", problem, z[: problem.start.size], r, s, constraints)
         if not solution.has_point:
@@ -67,7 +67,7 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
         before, step, length = objective, _vector(problem, solution.values) - z, 1.0
         for _ in range(HALVINGS):
             trial = z + length * step
-            r, s = problem.linearised(trial[: problem.start.size])
+            r, s = problem.linearise(trial[: problem.start.size])
             objective = float(np.sum(r**2) + np.sum((believed @ trial - wanted) ** 2))
             if np.isfinite(objective) and objective <= before:
                 break
@@ -98,7 +98,7 @@ class Refitted:
 def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, constraints: Sequence[Any] | str
           ) -> Problem:
     """State the problem linearised at theta: one sum of squares, of the record and of the prior."""
-    believed, wanted = problem.believed()
+    believed, wanted = problem.prior_rows()
     rows = np.vstack([np.pad(s, ((0, 0), (0, len(problem.curves)))), believed])
     q = rows.shape[1]
     factor: Any = np.linalg.qr(np.column_stack([rows, np.concatenate([s @ theta - r, wanted])]), mode="r")

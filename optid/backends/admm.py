@@ -41,7 +41,7 @@ def minimise(problem: NuclearProblem, weight: float, gap: float = 1e-7, limit: i
 
     It stops at a relative duality gap, or at a number of iterations.
     """
-    v, theta = problem.data, problem.explained(problem.hankel(problem.data))
+    v, theta = problem.data, problem.predictor_coefficients(problem.hankel(problem.data))
     reached = problem.matrix(v, theta)
     step = problem.shape[0] / max(float(np.linalg.norm(reached)) * np.sqrt(problem.shape[0]), 1e-300)
     scaled = np.zeros(problem.shape)

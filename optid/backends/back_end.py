@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import is_number, shown
+from optid.arrays import is_number, short_repr
 from optid.core.form import Form
 from optid.errors import StructureError
 from optid.program.solution import Status
@@ -30,9 +30,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         if not is_number(self.accuracy) or not 0 < self.accuracy < 1:
-            raise StructureError(f"accuracy={shown(self.accuracy)}: it must be a number between 0 and 1")
+            raise StructureError(f"accuracy={short_repr(self.accuracy)}: it must be a number between 0 and 1")
         if self.time_limit is not None and (not is_number(self.time_limit) or not self.time_limit > 0):
-            raise StructureError(f"time_limit={shown(self.time_limit)}: it must be a positive number of seconds")
+            raise StructureError(f"time_limit={short_repr(self.time_limit)}: it must be a positive number of seconds")
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ def run(program: Program, settings: Settings) -> Answer:
     start = form.flat(program.start) if settings.warm and program.start else None
     limit = int(dict(settings.options).get("limit", 2000))
     found = minimise(form.problem, form.penalty, settings.accuracy, limit, start)
-    return found.answer(tolerance(settings.accuracy), form.shaped(found.point), form.duals(found.dual))
+    return found.answer(tolerance(settings.accuracy), form.unpack(found.point), form.duals(found.dual))
 
 
 def minimise(problem: GroupProblem, penalty: float, gap: float = 1e-9, limit: int = 2000,

@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.backends.back_end import Answer, Settings
-from optid.backends.dnlp import Smooth, kept, smooth
+from optid.backends.dnlp import Smooth, get_or_make, smooth
 from optid.core.program import Program
 from optid.errors import StructureError
 from optid.program.expressions import MOVES, sources
@@ -238,8 +238,8 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
         chosen = {"ipopt.mu_init": 1e-6} | chosen
     if name == "ipopt" and program.courses and not program.settled and chosen["ipopt.max_iter"] == LIMIT:
         chosen["ipopt.max_iter"] = FAR
-    graph = kept(program.problem, "casadi", lambda: translate(form))
-    solver = kept(program.problem, (name, repr(sorted(chosen.items()))),
+    graph = get_or_make(program.problem, "casadi", lambda: translate(form))
+    solver = get_or_make(program.problem, (name, repr(sorted(chosen.items()))),
                   lambda: ca.nlpsol("solver", name, graph, chosen))
     compiling = time.perf_counter() - clock
     lower, upper = form.bounds

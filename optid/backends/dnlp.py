@@ -107,10 +107,10 @@ def smooth(problem: cp.Problem) -> Smooth:
     Raises:
         StructureError: a part that the smooth chain does not carry over faithfully.
     """
-    return kept(problem, "smooth", lambda: _apply(problem))
+    return get_or_make(problem, "smooth", lambda: _apply(problem))
 
 
-def kept(problem: cp.Problem, key: Any, make: Callable[[], Any]) -> Any:
+def get_or_make(problem: cp.Problem, key: Any, make: Callable[[], Any]) -> Any:
     """Return what is kept under a key with the problem, in whose cache of compiled solvers it lives; made once."""
     found = problem._solver_cache.setdefault(CACHE, {})
     if key not in found:
@@ -143,7 +143,7 @@ class Derivatives:
     @classmethod
     def of(cls, form: Smooth) -> "Derivatives":
         """Return the compiled derivatives of a smooth problem, made once, at the values the parameters hold now."""
-        found = kept(form.original, "derivatives", lambda: cls(form))
+        found = get_or_make(form.original, "derivatives", lambda: cls(form))
         if found._problem.parameters():
             found._oracles.update_params(found._problem)
         found._x = None

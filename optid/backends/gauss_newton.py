@@ -65,7 +65,7 @@ def _minimum(program: Program, form: RankOneForm, count: int, seed: int) -> Loca
 
 def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np.ndarray]:
     """Name the parts of a point, in the programme's gauge."""
-    values = form.named(point, program.shapes)
+    values = form.unpack(point, program.shapes)
     for (mu, b), direction in zip(form.blocks, point.bs):
         size = float(np.linalg.norm(direction)) or 1.0  # the sign stays: constraints may depend on it
         if form.gauge != "norm":

@@ -23,5 +23,5 @@ def run(program: Program, settings: Settings) -> Answer:
     lengths[lengths == 0] = 1.0
     found = lstsq(root / lengths, target, lapack_driver="gelsy")
     z = found[0] / lengths  # pyright: ignore[reportOptionalSubscript]
-    values = form.named(Point(z, (), ()), program.shapes)
+    values = form.unpack(Point(z, (), ()), program.shapes)
     return Answer(Status.LOCAL, "factorised", values, {"residual": -2.0 * (root @ z - target)})

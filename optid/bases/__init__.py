@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import shown
+from optid.arrays import short_repr
 from optid.bases.basis import Basis
 from optid.bases.expansions import Linear, Polynomial, Trigonometric, UserFunctions
 from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
@@ -151,14 +151,14 @@ def _one_each(given: Any, channels: Sequence[str], kind: str, ranges: Sequence[A
             continue
         family = parse(one) if isinstance(one, str) else one
         if not isinstance(family, Basis):
-            raise StructureError(f"the {feedback}basis of {kind} {channel!r} is {shown(one)}: give one such as "
+            raise StructureError(f"the {feedback}basis of {kind} {channel!r} is {short_repr(one)}: give one such as "
                                  "Triangular(10) or its name, 'triangular:10'")
         if low != low:
             raise DataError(f"{kind} {channel!r} has no sample at all; choose another column or drop the {kind}")
         if low == high:
             raise DataError(f"{kind} {channel!r} is constant ({low:g}): nothing can be identified from it; "
                             "excite the input or drop the channel, or begin the record before its step")
-        found.append(family.fitted(float(low), float(high)))
+        found.append(family.with_interval(float(low), float(high)))
     return found
 
 

@@ -27,7 +27,7 @@ class Basis:
     `_derivative`, `_quadrature` and, where functions vanish, `_evaluate`, and better shape matrices where it has them.
 
     Attributes:
-        interval: (lower, upper) in units of the input; None until `fitted`.
+        interval: (lower, upper) in units of the input; None until `with_interval`.
         outside: what happens beyond the interval: "clamp" (f stays at its end value), "linear" (it goes on straight),
             "extrapolate" (its formula goes on) or "error".
         shape_exact: True when the rows of `increments`, `curvature` and `slope_rows` are necessary and sufficient on
@@ -67,7 +67,7 @@ class Basis:
         """(full_size, P) matrix T with values(u) = complete(u) @ T; the identity where nothing is redundant."""
         return self._reduced(np.eye(self.full_size))
 
-    def fitted(self, lo: float, hi: float) -> Self:
+    def with_interval(self, lo: float, hi: float) -> Self:
         """Return the same basis on [lo, hi], or itself when it already has an interval.
 
         Raises:
@@ -82,7 +82,7 @@ class Basis:
                             "record in which the input moves, or give the basis its interval.")
         return replace(cast(Any, self), interval=(float(lo), float(hi)))
 
-    def mapped(self, scale: float, offset: float) -> tuple["Basis", Array, Array]:
+    def in_units(self, scale: float, offset: float) -> tuple["Basis", Array, Array]:
         """Express the basis in the units v = scale * u + offset.
 
         Returns:

@@ -129,9 +129,9 @@ class Linear(Basis):
         """One function."""
         return 1
 
-    def mapped(self, scale: float, offset: float) -> tuple[Basis, Array, Array]:
+    def in_units(self, scale: float, offset: float) -> tuple[Basis, Array, Array]:
         """Express u as (v - offset) / scale."""
-        new = self if self.interval is None else super().mapped(scale, offset)[0]
+        new = self if self.interval is None else super().in_units(scale, offset)[0]
         return new, np.array([[1 / scale]]), np.array([-offset / scale])
 
     def increments(self) -> Array:
@@ -191,10 +191,10 @@ class UserFunctions(Basis):
         """Number of functions."""
         return len(self.functions)
 
-    def mapped(self, scale: float, offset: float) -> tuple[Basis, Array, Array]:
+    def in_units(self, scale: float, offset: float) -> tuple[Basis, Array, Array]:
         """Refuse: functions of one unit are not known in another."""
         if (scale, offset) == (1.0, 0.0):
-            return super().mapped(scale, offset)
+            return super().in_units(scale, offset)
         raise StructureError("A model with UserFunctions keeps the units it was identified in: identify it on data "
                              "that are neither scaled nor detrended.")
 

@@ -176,7 +176,7 @@ def _climb(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: L
     if size > max_size:
         reason = f"{found.bound.reason}; the relaxation with {size} multipliers exceeds the limit {max_size}"
         return replace(found, bound=replace(found.bound, reason=reason))
-    return relaxed(case, found, steps)
+    return solve_relaxation(case, found, steps)
 
 
 def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: LinearRows) -> LadderCase:
@@ -233,7 +233,7 @@ def onto_minors(case: LadderCase, matrix: Array) -> Array:
     return clean
 
 
-def relaxed(case: LadderCase, found: Certification, steps: int) -> Certification:
+def solve_relaxation(case: LadderCase, found: Certification, steps: int) -> Certification:
     """The SDP: its bound made valid by shrinking, then its multipliers aligned with the point for an exact proof."""
     method = "product cuts" if case.cones else "sdp"
     solved = relax(case.objective, case.blocks, case.cones, case.linear)

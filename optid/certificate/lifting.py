@@ -66,7 +66,7 @@ def certify_rank_one(problem: Problem, values: Values, max_size: int = MAX_SIZE)
     found = certify(numbers, point, cones=lifted.cones, linear=lifted.linear, max_size=max_size)
     if not found.better or swapped:
         return found.bound, None
-    return found.bound, form.named(found.better[0], {name: np.shape(one) for name, one in problem.start.items()})
+    return found.bound, form.unpack(found.better[0], {name: np.shape(one) for name, one in problem.start.items()})
 
 
 def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, Point, bool]:

@@ -40,8 +40,9 @@ def reading(how: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a record as arguments of `optid.read`."""
     return {
         **how,
-        **{key: listed(how[key]) for key in ("inputs", "outputs", "columns", "input_units", "output_units", "quality")},
-        "missing": tuple(listed(how["missing"]) or ()),
+        **{key: split_names(how[key]) for key in ("inputs", "outputs", "columns", "input_units", "output_units",
+                                                  "quality")},
+        "missing": tuple(split_names(how["missing"]) or ()),
         "time": False if how["time"] == "none" else how["time"],
     }
 
@@ -128,7 +129,7 @@ def held_out(record: Any, share: float | None, files: Sequence[str] | None, how:
     return record.split(share)
 
 
-def listed(words: Sequence[str] | None) -> list[str] | None:
+def split_names(words: Sequence[str] | None) -> list[str] | None:
     """Split words at commas into names; None stays None."""
     return None if words is None else [part.strip() for word in words for part in word.split(",") if part.strip()]
 
@@ -140,7 +141,7 @@ def one_or_all(values: list[Any] | None) -> Any:
 
 def numbers(words: Sequence[str] | None, option: str) -> list[float] | None:
     """Read numbers, one per channel; None stays None; a `StructureError` names the option and the words."""
-    found = listed(words)
+    found = split_names(words)
     try:
         return None if found is None else [float(part) for text in found for part in text.split()]
     except ValueError:

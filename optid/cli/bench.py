@@ -29,7 +29,7 @@ def workbench(data: Paths = None, example: str | None = None, *, how: dict[str, 
 
     import_cvxpy()
     from optid.workbench.bench import BenchSource
-    from optid.workbench.request import suggested
+    from optid.workbench.request import suggest_state
     from optid.workbench.script import reading
     from optid.workbench.server import serve
 
@@ -43,4 +43,4 @@ def workbench(data: Paths = None, example: str | None = None, *, how: dict[str, 
 
             webbrowser.open(redirect.as_uri())
 
-    serve(BenchSource(record, expression, suggested(record, suggestion), plant), port, ready)
+    serve(BenchSource(record, expression, suggest_state(record, suggestion), plant), port, ready)

@@ -64,7 +64,7 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
     arguments |= assumed
     constraints = constraint if constraint is not None else arguments.pop("constraints", [])
     arguments["constraints"] = [] if constraints == ["none"] else constraints
-    chosen = words.listed(solvers) or ["all"]
+    chosen = words.split_names(solvers) or ["all"]
     try:
         study = Study(f"compare {entry['name']}", data=entry, formulations={"formulation": formulation, **arguments},
                       solvers="all" if chosen == ["all"] else chosen, accuracy=accuracy, time_limit=time_limit,
@@ -116,7 +116,7 @@ def _show(found: Any, formulation: str, record: str) -> None:
     from optid.phrases import seconds
     from optid.program.solution import GRADIENT
     from optid.show.wording import number
-    from optid.studies.verdicts.choice import listed
+    from optid.studies.verdicts.choice import join_names
     from optid.studies.verdicts.outcomes import SOLVED
 
     absent = {name for name, back_end in back_ends().items() if not back_end.installed}
@@ -137,7 +137,7 @@ def _show(found: Any, formulation: str, record: str) -> None:
                 ("solver", "verified", "excess", "residual", "cold", "warm", "1-step", "simul."), table,
                 firm=(0, *range(2, 8)), right=range(2, 8), padding=(0, 0, 0, 1))
     for reason, solvers in found.reasons.items():
-        print_text(Text(f"{listed(solvers, most=20)}: {reason}", "dim"))
+        print_text(Text(f"{join_names(solvers, most=20)}: {reason}", "dim"))
     unfit = []
     for solver, reason in found.refused.items():
         if solver in absent or not found.lines:  # with what to install, or which solvers take it

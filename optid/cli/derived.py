@@ -23,7 +23,7 @@ class FittingCommand(Command):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse, after adding the options of the formulation to those of the command."""
         self.params = [p for p in self.params if not getattr(p, "derived", False)]
-        name = chosen(args)
+        name = find_formulation(args)
         try:
             entry_point(FORMULATIONS, name)
         except LookupFailed as error:
@@ -50,7 +50,7 @@ def _refused(error: LookupFailed) -> typer.Exit:
     return typer.Exit(exit_code(error))
 
 
-def chosen(args: Sequence[str]) -> str:
+def find_formulation(args: Sequence[str]) -> str:
     """Return the formulation named on the command line, or that of the example, or the default."""
     found = example = None
     for word, following in zip(args, [*args[1:], ""]):
@@ -132,14 +132,14 @@ def unknown(name: str, option: str) -> str:
 
 def _json(key: str, words: Any) -> str:
     """Write the words of the option of an argument as the value of ``--set``: JSON, several as a list."""
-    from optid.cli.arguments import listed, one_or_all, value
+    from optid.cli.arguments import one_or_all, split_names, value
 
     if isinstance(words, bool):
         return json.dumps(words)
     whole = [value(word) for word in words]
     if len(whole) == 1 and isinstance(whole[0], list):  # JSON, which may be nested
         return words[0]
-    found = listed(words)
+    found = split_names(words)
     if not found:
         raise typer.BadParameter(f"{option_of(key)} needs a value")
     return json.dumps(one_or_all([value(word) for word in found]))

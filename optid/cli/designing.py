@@ -49,8 +49,8 @@ def design(like: Words = None, example: str | None = None, *, how: dict[str, Any
         found = designed(
             record, kind, n=samples, levels=levels, band=None if band is None else (band[0], band[1]),
             amplitude=words.one_or_all(pairs), shaped=shaped, hold=hold, periods=periods, candidates=candidates,
-            seed=seed, rows=rows, basis=words.one_or_all(words.listed(basis)) or "polynomial:4",
-            feedback_basis=words.one_or_all(words.listed(feedback_basis)),
+            seed=seed, rows=rows, basis=words.one_or_all(words.split_names(basis)) or "polynomial:4",
+            feedback_basis=words.one_or_all(words.split_names(feedback_basis)),
         )
         work.write("excitation", output, found.save)
         work.text = str(found)
@@ -81,8 +81,8 @@ def order(data: Paths = None, example: str | None = None, *, how: dict[str, Any]
         work.step("comparing orders")
         from optid.identify.order import order as study
 
-        found = study(record, basis=words.one_or_all(words.listed(basis)),
-                      feedback_basis=words.one_or_all(words.listed(feedback_basis)), block_rows=block_rows, nx=nx,
+        found = study(record, basis=words.one_or_all(words.split_names(basis)),
+                      feedback_basis=words.one_or_all(words.split_names(feedback_basis)), block_rows=block_rows, nx=nx,
                       na=na, nb=nb, nk=nk, holdout=holdout, level=level)
         work.text = str(found)
         work.draw(found.plot, picture)

@@ -36,9 +36,9 @@ def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: fl
 
         plant = words.state_space_model(model)
         work.step("signatures")
-        found = dictionary(plant, kinds=words.listed(kinds) or ["bias"],
+        found = dictionary(plant, kinds=words.split_names(kinds) or ["bias"],
                            process=words.directions(load, "--process", plant), state_jump=state_jump,
-                           disturbances=words.listed(disturbance) or ())
+                           disturbances=words.split_names(disturbance) or ())
         work.step("simulating faults")
         study = simulate(found, window, onset=onset if onset == "unknown" else int(onset), prob=prob,
                          false_alarm=false_alarm, draws=draws, seed=seed)
@@ -95,9 +95,9 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
         origin = _origin(identified, how)
         work.step("signatures")
         found = dictionary(
-            plant, kinds=words.listed(kinds) or list(KINDS), process=words.directions(load, "--process", plant),
-            state_jump=state_jump, disturbances=words.listed(disturbance) or (),
-            zeros=words.pairs(words.listed(zero), "--zero", ZERO, float),
+            plant, kinds=words.split_names(kinds) or list(KINDS), process=words.directions(load, "--process", plant),
+            state_jump=state_jump, disturbances=words.split_names(disturbance) or (),
+            zeros=words.pairs(words.split_names(zero), "--zero", ZERO, float),
         )
         work.step("searching")
         uncertainty: Any = "ignore"
@@ -170,7 +170,7 @@ def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: st
         plant = words.state_space_model(model)
         found = load_diagnosis(diagnosis)
         record: Any = words.record(data, reading_for(plant, how), example, seed)[0]
-        given = words.listed(constraint)
+        given = words.split_names(constraint)
         work.step("refitting")
         built = rebuild(
             plant, found, record, constraints="default" if given is None else [] if given == ["none"] else given,

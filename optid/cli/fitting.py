@@ -128,7 +128,7 @@ def _save(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths
 
     record = None
     if data and held_out is None:
-        named = {key: words.listed(value) if isinstance(value, list) else value for key, value in how.items()}
+        named = {key: words.split_names(value) if isinstance(value, list) else value for key, value in how.items()}
         record = {**named, "files": [str(Path(name).resolve()) for name in data]}
     work.write("model", saved, lambda path: save_model(found.model, path, record))
 

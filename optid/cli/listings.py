@@ -9,7 +9,7 @@ from rich.text import Text
 from optid.cli.options import option_of
 from optid.cli.terminal import Spinner, print_table, print_text
 from optid.descriptions import Description, describe, describe_function
-from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, entry_point, registered
+from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, entry_point, find_entry_points
 
 _SECTION = re.compile(r"(Args|Raises|Returns|Warns|Attributes|Named variables):")
 """Paragraphs of a docstring that are no text."""
@@ -60,7 +60,7 @@ def formulations(name: str | None = None) -> None:
 def constraints() -> None:
     """List the constraints and their arguments."""
     rows = []
-    for name, point in sorted(registered(CONSTRAINTS).items()):
+    for name, point in sorted(find_entry_points(CONSTRAINTS).items()):
         found = _described(point)
         if isinstance(found, Text):
             rows.append((Text(name, "dim"), "", found))
@@ -95,7 +95,7 @@ def systems() -> None:
 
 def _explain(name: str) -> None:
     """Print the docstring of a formulation or of a fault programme, its arguments and its variables."""
-    known = registered(FAULTS)
+    known = find_entry_points(FAULTS)
     found = describe(known[name] if name in known else entry_point(FORMULATIONS, name))
     head, _, rest = found.text.partition("\n\n")
     more = [part for part in re.split(r"\n\n", rest) if not _SECTION.match(part)] if rest else []
@@ -117,7 +117,7 @@ def _required(found: Description) -> list[str]:
 
 def _entries(group: str) -> list[tuple[Text, Text]]:
     rows = []
-    for name, point in sorted(registered(group).items()):
+    for name, point in sorted(find_entry_points(group).items()):
         found = _described(point)
         if isinstance(found, Text):
             rows.append((Text(name, "dim"), found))

@@ -17,7 +17,7 @@ from typing import Annotated, Any, get_origin
 import typer
 
 from optid.descriptions import Description, describe
-from optid.registry import FORMULATIONS, registered
+from optid.registry import FORMULATIONS, find_entry_points
 
 Words = list[str] | None
 Paths = list[Path] | None
@@ -113,8 +113,8 @@ def register(app: typer.Typer, function: Callable[..., None], kind: Any) -> None
     if text is None:  # python -OO
         source: Any = ast.parse(inspect.getsource(function)).body[0]
         text = ast.get_docstring(source) or ""
-    about, own = described(text)
-    entries = described(SHARED)[1] | own
+    about, own = parse_docstring(text)
+    entries = parse_docstring(SHARED)[1] | own
     parameters = []
     for parameter in inspect.signature(function).parameters.values():
         if parameter.name == "how":
@@ -136,7 +136,7 @@ def register(app: typer.Typer, function: Callable[..., None], kind: Any) -> None
     app.command(cls=kind, help=about)(run)
 
 
-def described(text: str) -> tuple[str, dict[str, tuple[str, str, str]]]:
+def parse_docstring(text: str) -> tuple[str, dict[str, tuple[str, str, str]]]:
     """Return what a docstring says before the sections, and {parameter: (panel, words, help)}."""
     about, *sections = re.split(r"(?:\n|^)(?=[A-Z][\w ]*:\n    )", text)
     found = {}
@@ -157,7 +157,7 @@ def option_of(argument: str) -> str:
 
 def descriptions() -> Iterator[tuple[str, Description]]:
     """Yield the name and the description of every formulation that can be loaded."""
-    for name, point in sorted(registered(FORMULATIONS).items()):
+    for name, point in sorted(find_entry_points(FORMULATIONS).items()):
         with suppress(ImportError):  # a broken plug-in takes nothing away
             yield name, describe(point)
 

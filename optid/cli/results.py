@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from optid.cli.terminal import Spinner, capture_warnings, coloured, note, print_text
+from optid.cli.terminal import Spinner, capture_warnings, highlight, note, print_text
 from optid.errors import DataError, StructureError
 from optid.registry import CONSTRAINTS, FORMULATIONS, entry_point, render
 
@@ -112,7 +112,7 @@ class Work(Spinner):
     def print(self) -> None:
         """Print the result, the warnings that it does not contain, and the files written."""
         if self.text:
-            print_text(coloured(self.text))
+            print_text(highlight(self.text))
         said = " ".join(self.text.split())
         for sentence in self.heard:
             if " ".join(sentence.split()) not in said:

@@ -75,9 +75,9 @@ def _executor(scheduler: str | None) -> Iterator[Any]:
     if scheduler is None:
         yield None
         return
-    from optid.data.clusters import connected
+    from optid.data.clusters import connect_cluster
 
-    with connected(scheduler) as client:
+    with connect_cluster(scheduler) as client:
         yield client.get_executor()
 
 
@@ -111,7 +111,7 @@ def _print_superseded(db: Path, study: str | None) -> None:
     if db.suffix == ".parquet":
         return
     with Store(db) as store:
-        count = sum(store.superseded(study).values())
+        count = sum(store.count_superseded(study).values())
     if count:
         rows, stay = ("row", "is") if count == 1 else ("rows", "are")
         print_text(Text(f"{count:,} {rows} of former entries, data, settings or versions, or of cells that were run "

@@ -145,7 +145,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str 
         output().print(Text(footer, "dim"))
 
 
-def coloured(text: str) -> Text:
+def highlight(text: str) -> Text:
     """Return a printed result with its headings and its verdict in colour."""
     result = Text(text)
     result.highlight_regex(r"(?m)^\S.*(?=\n[-=─═]{3})", "bold")

@@ -21,7 +21,7 @@ from optid.core.leaves import LeafSpace
 from optid.core.terms import Values
 from optid.errors import StructureError
 from optid.program.expressions import affine_parts, flat_value, has_kinks, jacobians, row_sizes
-from optid.program.limits import EQUALITIES, Limit, named, rows_of
+from optid.program.limits import EQUALITIES, Limit, name_limits, rows_of
 from optid.program.view import View
 
 NEGLIGIBLE = 64 * float(np.finfo(float).eps)  # share of its constant beneath which a row has no size of its own
@@ -211,7 +211,7 @@ class ConstraintReader:
                 continue
             reference.asked, view.asked = False, set()
             default = getattr(builder, "name", None) or f"constraint {number - len(own) + 1}"
-            built = named(builder(view) if callable(builder) else builder, default)
+            built = name_limits(builder(view) if callable(builder) else builder, default)
             moving = reference.asked and "reference" not in self.facts or bool(view.asked & self.about)
             for name, limits in built.items():
                 if any(one.name == name and one.builder != number for one in found):

@@ -56,7 +56,7 @@ class GroupSparseForm(Form):
         """Return a from named values."""
         return np.concatenate([np.ravel(np.asarray(values[name], dtype=float)) for name in self.blocks])
 
-    def shaped(self, a: Array) -> dict[str, Array]:
+    def unpack(self, a: Array) -> dict[str, Array]:
         """Return named values from a."""
         cuts = np.cumsum([int(np.prod(shape)) for shape in self.blocks.values()])[:-1]
         return {name: part.reshape(shape) for (name, shape), part in zip(self.blocks.items(), np.split(a, cuts))}

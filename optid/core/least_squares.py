@@ -36,7 +36,7 @@ class LeastSquaresForm(Form):
         return Point(self.flat(values), tuple(np.asarray(values[mu], dtype=float) for mu, _ in self.blocks),
                      tuple(np.ravel(values[b], order="F") for _, b in self.blocks))
 
-    def named(self, point: Point, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
+    def unpack(self, point: Point, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
         """Name the parts of a point, in the shapes of the variables."""
         parts = np.split(point.w, np.cumsum([prod(shapes[name]) for name in self.linear])[:-1])
         found = dict(zip(self.linear, parts))

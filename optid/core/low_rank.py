@@ -26,7 +26,8 @@ class LowRank:
     def start(self) -> dict[str, np.ndarray]:
         """Return the measured outputs, and the coefficients that explain most of them."""
         numbers = self.numbers
-        explained = {} if numbers.predictor is None else {"T": numbers.explained(numbers.hankel(numbers.data))}
+        explained = {} if numbers.predictor is None else {
+            "T": numbers.predictor_coefficients(numbers.hankel(numbers.data))}
         return {"yhat": numbers.data, **explained}
 
     def misfit(self, weight: float) -> Squares:

@@ -213,7 +213,7 @@ class Problem:
         further = {} if self.further is None else self.further(leaves, x)
         return {name: one for name, one in {**leaves, **further}.items() if one is not None}
 
-    def shown(self, x: Values) -> dict[str, Array]:
+    def named_quantities(self, x: Values) -> dict[str, Array]:
         """Return the values at a point of everything that constraints may use, in the units of the record."""
         self.space.assign(self.leaf_values(x))
         view = View(self.expressions(self.space.variables, x), **{"reference": x, **self.facts})

@@ -73,7 +73,7 @@ class CvxpyStatement:
         swap = {id(variable): leaves[name] for name, variable in problem.space.variables.items() if name in leaves
                 } if problem.constraints() else {}
         for one in problem.constraints():
-            member = one.limit.posed(one.sizes).tree_copy(swap)
+            member = one.limit.impose(one.sizes).tree_copy(swap)
             constraints[one.name] = (*constraints.get(one.name, ()), member)
         view = View(problem.expressions(leaves, problem.start), **{"reference": problem.start, **problem.facts})
         return cls(cp.Minimize(sum_of(parts)), constraints, variables, derived, view)
@@ -204,7 +204,7 @@ class Program:
         """Number of scalar variables."""
         return self.core.size + sum(self.own.values())
 
-    def completed(self, x: Values) -> dict[str, np.ndarray]:
+    def complete_values(self, x: Values) -> dict[str, np.ndarray]:
         """Return values of the unknowns with those of the statement's other variables."""
         found, y = {name: x[name] for name in self.core.start}, self.core.leaf_values(x)
         for term in self.core.terms:

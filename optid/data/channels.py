@@ -127,7 +127,7 @@ def count_levels(x: np.ndarray, most: int = MOST_LEVELS) -> int:
     return int(seen.size)
 
 
-def listed(names: str | Sequence[str] | None) -> list[str] | None:
+def as_name_list(names: str | Sequence[str] | None) -> list[str] | None:
     """Return one name or several as a list; None stays None."""
     if names is None or isinstance(names, str):
         return None if names is None else [names]
@@ -156,7 +156,7 @@ def channel_fields(
     for kind, letter, count, given, units in (
         ("input", "u", m, inputs, input_units), ("output", "y", l, outputs, output_units)
     ):
-        names, units = listed(given), listed(units) or [""] * count
+        names, units = as_name_list(given), as_name_list(units) or [""] * count
         if names is not None and (len(names) != count or not all(isinstance(name, str) and name for name in names)):
             raise DataError(f"{kind}s {names}: must be one non-empty name for each of the {count} channels.")
         if len(units) != count:

@@ -28,7 +28,7 @@ SOURCES = ("optid", "formulations")
 
 
 @contextmanager
-def connected(scheduler: Any, packages: Sequence[str] = PACKAGES) -> Iterator[Any]:
+def connect_cluster(scheduler: Any, packages: Sequence[str] = PACKAGES) -> Iterator[Any]:
     """Give a `distributed.Client` whose workers run the same versions as this process.
 
     Args:

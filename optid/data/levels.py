@@ -9,7 +9,7 @@ from optid.data.record import Data
 from optid.errors import DataError
 
 
-def levelled(data: Data) -> tuple[Data, Array]:
+def remove_levels(data: Data) -> tuple[Data, Array]:
     """Return the record with the outputs of all experiments about one level, and what was subtracted (E, l).
 
     The shifts sum to zero, so that the mean of the constants of the experiments of a linear equation stays. An
@@ -24,4 +24,4 @@ def levelled(data: Data) -> tuple[Data, Array]:
                         "unknown: leave the experiment out (data.select(experiments=...)), or use offset=True")
     shifts = means - means.mean(axis=0)
     outputs = iter([e.y - shift for e, shift in zip(data.experiments, shifts)])
-    return data.mapped(lambda u: u, lambda _: next(outputs)), shifts
+    return data.map_signals(lambda u: u, lambda _: next(outputs)), shifts

@@ -28,7 +28,7 @@ def detrend(data: Changed, order: int = 0) -> Changed:
     """
     if isinstance(order, bool) or order not in (0, 1):
         raise DataError(f"detrend order {order!r}: 0 (mean) and 1 (mean, and drift of the outputs) exist.")
-    level = data if order == 0 else data.mapped(lambda u: u, _without_drift)
+    level = data if order == 0 else data.map_signals(lambda u: u, _without_drift)
     for channel in level.channels:
         if channel.missing == 1.0:
             raise DataError(f"channel {channel.name!r}: every sample is missing; leave it out with select.")
@@ -89,7 +89,7 @@ def resample(data: Changed, dt: float) -> Changed:
         raise DataError(f"dt = {dt:g} is in no ratio of integers up to 1000 to the sampling time of the record, "
                         f"{data.dt:g}; choose another one.")
     found = _at_ratio(data, ratio.numerator, ratio.denominator)
-    return found.mapped(lambda u: u, lambda y: y, dt=dt)
+    return found.map_signals(lambda u: u, lambda y: y, dt=dt)
 
 
 def filter(data: Changed, low: float | None = None, high: float | None = None, order: int = 4) -> Changed:
@@ -123,10 +123,10 @@ def filter(data: Changed, low: float | None = None, high: float | None = None, o
     sections = butter(order, edges if len(edges) == 2 else edges[0], kind, fs=1 / data.dt, output="sos")
     rest = sosfilt_zi(sections)[:, :, None]
 
-    def filtered(samples: np.ndarray) -> np.ndarray:
+    def filter_samples(samples: np.ndarray) -> np.ndarray:
         return sosfilt(sections, samples, axis=0, zi=rest * samples[:1])[0]
 
-    return data.mapped(filtered, filtered)
+    return data.map_signals(filter_samples, filter_samples)
 
 
 def _check_whole(data: Any) -> None:
@@ -150,12 +150,12 @@ def _at_ratio(data: Changed, up: int, down: int) -> Changed:
 
     taps = firwin(20 * q + 1, 1.0 / q, window="hamming")
     lowpass = partial(resample_poly, up=up, down=down, axis=0, window=taps, padtype="line")
-    return data.mapped(lowpass, lowpass, dt=data.dt * down / up)
+    return data.map_signals(lowpass, lowpass, dt=data.dt * down / up)
 
 
 def _rescaled(data: Changed, scale: np.ndarray, shift: np.ndarray) -> Changed:
     m = data.m
-    return data.mapped(
+    return data.map_signals(
         lambda u: (u - shift[:m]) / scale[:m],
         lambda y: (y - shift[m:]) / scale[m:],
         transform=data.transform.before(scale, shift),

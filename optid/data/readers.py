@@ -120,7 +120,7 @@ def _runs(table: RawTable, inputs: Wanted, outputs: Wanted, time: Any, experimen
     try:
         ins, outs = choose(table.names, inputs, "u", label), choose(table.names, outputs, "y", label)
     except DataError as error:
-        raise long_tables.explained(error, table, inputs, outputs) from None
+        raise long_tables.explain_missing_column(error, table, inputs, outputs) from None
     if table.split is not None:
         tables = table.split([*ins.values(), *outs.values()], time)
         return [run for one in tables for run in _runs(one, ins, outs, None if time is True else time, experiment)]
@@ -128,7 +128,7 @@ def _runs(table: RawTable, inputs: Wanted, outputs: Wanted, time: Any, experimen
     clocks = clock_columns(table.names, time, signals, label, table.index, table.dates)
     group = None if experiment is None else known.column_name(table.names, experiment, label)
     goods: dict[str, str] = dict(how.quality or {})
-    quality = known.guarded(goods, table.names, signals, label)
+    quality = known.check_quality_columns(goods, table.names, signals, label)
     others = [name for name in (*clocks, *([group] if group is not None else []), *quality) if name not in signals]
     unused = [name for name in known.quality_columns(table.names, signals) if name not in (*quality, *others)]
     wanted = list(dict.fromkeys([*signals, *others, *unused]))

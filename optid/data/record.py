@@ -8,9 +8,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from optid.arrays import as_list, as_records, frozen, import_pandas, one_or_all
+from optid.arrays import as_list, as_records, import_pandas, one_or_all, read_only
 from optid.data import preprocessing
-from optid.data.channels import Channel, Ports, Transform, channel_fields, interval_text, listed, sampling_time
+from optid.data.channels import Channel, Ports, Transform, as_name_list, channel_fields, interval_text, sampling_time
 from optid.data.description import DataDescription, instant
 from optid.data.timeline import Timeline, read_times, seconds_of, starts_of
 from optid.errors import DataError, nearest
@@ -100,8 +100,8 @@ class Data(Ports):
         Warns:
             DataWarning: integer samples that look saturated or wrapped around.
         """
-        us = as_records(u, "u", listed(inputs))
-        ys = as_records(y, "y", listed(outputs))
+        us = as_records(u, "u", as_name_list(inputs))
+        ys = as_records(y, "y", as_name_list(outputs))
         if len(us) != len(ys):
             raise DataError(f"u has {len(us)} experiments and y has {len(ys)}; give one array of each per experiment.")
         starts, dated = starts_of(start, len(us))
@@ -379,7 +379,7 @@ class Data(Ports):
         kept = [self.experiments[k] for k in picked]
         t = self.transform
         return self._with(
-            experiments=tuple(Experiment(frozen(e.u[:, i]), frozen(e.y[:, o]), e.start, e.stamps) for e in kept),
+            experiments=tuple(Experiment(read_only(e.u[:, i]), read_only(e.y[:, o]), e.start, e.stamps) for e in kept),
             inputs=_take(self.inputs, i), outputs=_take(self.outputs, o), input_units=_take(self.input_units, i),
             output_units=_take(self.output_units, o),
             transform=Transform(_take(t.u_scale, i), _take(t.u_offset, i), _take(t.y_scale, o), _take(t.y_offset, o)),
@@ -426,7 +426,7 @@ class Data(Ports):
         if self.transform.is_identity:
             return self
         if self not in _RAW:
-            _RAW[self] = self.mapped(self.transform.raw_u, self.transform.raw_y,
+            _RAW[self] = self.map_signals(self.transform.raw_u, self.transform.raw_y,
                                      transform=Transform.identity(self.m, self.l))
         return _RAW[self]
 
@@ -438,19 +438,19 @@ class Data(Ports):
         """Return the same samples without the way back to raw units."""
         return self._with(transform=Transform.identity(self.m, self.l))
 
-    def mapped(self, of_u: Callable, of_y: Callable, **changes: Any) -> "Data":
+    def map_signals(self, of_u: Callable, of_y: Callable, **changes: Any) -> "Data":
         """Return data with every u (N, m) and y (N, l) replaced by of_u(u) and of_y(y), and other fields by `changes`.
 
         The functions must not change their arguments.
         """
-        experiments = tuple(replace(e, u=frozen(of_u(e.u)), y=frozen(of_y(e.y))) for e in self.experiments)
+        experiments = tuple(replace(e, u=read_only(of_u(e.u)), y=read_only(of_y(e.y))) for e in self.experiments)
         return self._with(experiments=experiments, **changes)
 
     def _cut(self, e: Experiment, first: int, last: int) -> Experiment:
         if e.stamps is None:
             return Experiment(e.u[first:last], e.y[first:last], e.start + first * self.dt)
         t = e.stamps[first:last]
-        return Experiment(e.u[first:last], e.y[first:last], e.start + float(t[0]), frozen(t - t[0]))
+        return Experiment(e.u[first:last], e.y[first:last], e.start + float(t[0]), read_only(t - t[0]))
 
     def _with(self, **changes: Any) -> "Data":
         return _filled(object.__new__(Data), **{f.name: getattr(self, f.name) for f in fields(self)} | changes)
@@ -466,7 +466,7 @@ def _filled(data: Data, **values: Any) -> Data:
 
 
 def _positions(wanted: str | Sequence[str] | None, known: tuple[str, ...], what: str) -> list[int]:
-    wanted = list(known) if wanted is None else listed(wanted)
+    wanted = list(known) if wanted is None else as_name_list(wanted)
     for name in wanted or ():
         if name not in known:
             raise DataError(f"no {what} {name!r}. {nearest(name, known)}")

@@ -29,7 +29,7 @@ def available_cores(number: int | None, name: str = "threads", error: type[Optid
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def mapped(function: Callable[[One], Result], parts: Iterable[One], threads: int) -> Iterator[Result]:
+def map_parts(function: Callable[[One], Result], parts: Iterable[One], threads: int) -> Iterator[Result]:
     """Yield function(part) for every part, in the order of the parts.
 
     With one thread, or one part, nothing is started; else the calling thread reads the parts, one ahead of those at
@@ -50,7 +50,7 @@ def mapped(function: Callable[[One], Result], parts: Iterable[One], threads: int
             yield running.popleft().result()
 
 
-def reduced(parts: Sequence[Part], leaf: Callable[[Part], Result], merge: Callable[[Sequence[Result]], Result],
+def reduce_parts(parts: Sequence[Part], leaf: Callable[[Part], Result], merge: Callable[[Sequence[Result]], Result],
             scheduler: Any = None, threads: int = 1) -> Result:
     """Return the merged results of all parts.
 
@@ -66,7 +66,7 @@ def reduced(parts: Sequence[Part], leaf: Callable[[Part], Result], merge: Callab
         ClusterError: the cluster cannot be used.
     """
     if scheduler is None and all(part.content is None for part in parts):
-        return tree(mapped(leaf, parts, threads), len(parts), merge)
+        return tree(map_parts(leaf, parts, threads), len(parts), merge)
     from dask.delayed import delayed
 
     task = delayed(_of_part, pure=False)
@@ -88,7 +88,7 @@ def _merged(results: Iterable[Any], merge: Callable[[Sequence[Any]], Any]) -> It
         yield merge(neighbours)
 
 
-def fetched(part: Part, scheduler: Any = None) -> Part:
+def fetch_part(part: Part, scheduler: Any = None) -> Part:
     """Return a part with its content, computed where it is a Dask collection."""
     return part if part.content is None else replace(part, content=_computed(part.content, scheduler))
 
@@ -98,9 +98,9 @@ def _computed(task: Any, scheduler: Any) -> Any:
         from dask.base import compute
 
         return compute(task)[0]
-    from optid.data.clusters import connected, result_of
+    from optid.data.clusters import connect_cluster, result_of
 
-    with connected(scheduler) as client:
+    with connect_cluster(scheduler) as client:
         return result_of(client, task)
 
 

@@ -10,15 +10,15 @@ import numpy as np
 
 from optid.arrays import check_integer
 from optid.data.channels import Ports, Transform, channel_fields, interval_text, sampling_time
-from optid.data.reading.chunks import Channels, Chunk, End, Survey, joined, surveyed
+from optid.data.reading.chunks import Channels, Chunk, End, Survey, join_surveys, survey_part
 from optid.data.reading.clock import TimeColumn, clock_columns
 from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.parts import Part
 from optid.data.reading.rival_clocks import settle
 from optid.data.reading.sources import Source, open_source
-from optid.data.reading.uniform import COARSE, agreed_step, repeated, uniform_step
-from optid.data.reduction import available_cores, fetched, reduced
+from optid.data.reading.uniform import COARSE, agreed_step, share_of_repeats, uniform_step
+from optid.data.reduction import available_cores, fetch_part, reduce_parts
 from optid.errors import DataError
 
 CHUNK = 131072  # samples read at a time: two channels of float64 fit into the second-level cache of a common processor
@@ -80,7 +80,7 @@ class Stream(Ports):
 
     def _sources(self) -> Iterator[Part]:
         """Yield the parts, with computed Dask content, or the whole record."""
-        yield from (fetched(part, self.scheduler) for part in self.parts)
+        yield from (fetch_part(part, self.scheduler) for part in self.parts)
         if not self.parts and self._whole is not None:
             yield self._whole
 
@@ -119,10 +119,10 @@ class Stream(Ports):
                 break
         return found
 
-    def reduced(self, leaf: Callable[[Part, Iterable[Chunk]], Result], merge: Callable[[Sequence[Result]], Result],
+    def reduce(self, leaf: Callable[[Part, Iterable[Chunk]], Result], merge: Callable[[Sequence[Result]], Result],
                 threads: int = 1) -> Result:
-        """Reduce the parts, each with its chunks, where they are stored; see `optid.data.reduction.reduced`."""
-        return reduced(self.parts, partial(_of_part, leaf, self._channels), merge, self.scheduler, threads)
+        """Reduce the parts, each with its chunks, where they are stored; see `optid.data.reduction.reduce_parts`."""
+        return reduce_parts(self.parts, partial(_of_part, leaf, self._channels), merge, self.scheduler, threads)
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -152,11 +152,11 @@ class Stream(Ports):
     def _survey(self) -> Survey:
         channels = replace(self._channels, units=None)
         if self.parts:
-            found = reduced(self.parts, partial(_of_part, surveyed, channels), partial(joined, channels),
+            found = reduce_parts(self.parts, partial(_of_part, survey_part, channels), partial(join_surveys, channels),
                             self.scheduler, available_cores(None))
         else:
             whole = next(self._sources())
-            found = surveyed(whole, channels.read(whole))
+            found = survey_part(whole, channels.read(whole))
         if not any(found.lengths.values()):
             raise self._no_rows()
         return found
@@ -205,9 +205,9 @@ def open_stream(  # noqa: D417 - the others stand with `read`
                            how.output_units or [units.get(column, "") for column in outs.values()])
     dt = None if dt is None else sampling_time(dt)
     if scheduler is not None:
-        from optid.data.clusters import connected
+        from optid.data.clusters import connect_cluster
 
-        with connected(scheduler):  # refused now, not at the first pass
+        with connect_cluster(scheduler):  # refused now, not at the first pass
             pass
     parts: list[Part] = []
     read = [*ins.values(), *outs.values(), *clocks]
@@ -217,7 +217,7 @@ def open_stream(  # noqa: D417 - the others stand with `read`
             raise DataError("a source of the list has no rows.")
     clock, step, said = None, dt, list[str]()
     if clocks:
-        sources = (fetched(part, scheduler) for part in parts) if parts else (one.whole for one in opened)
+        sources = (fetch_part(part, scheduler) for part in parts) if parts else (one.whole for one in opened)
         clock, step, said = _clock_and_step(sources, clocks, opened[0], dt, time is not None and time is not True)
     findings = [note for one in opened for note in one.findings]
     findings += said
@@ -259,7 +259,7 @@ def _clock_and_step(sources: Iterable[Any], columns: Sequence[str], table: Sourc
             continue
         clock, stamps, said = settle(block, columns, table, asked)
         if stamps.size > 1:
-            if dt is not None and repeated(stamps) > COARSE:
+            if dt is not None and share_of_repeats(stamps) > COARSE:
                 raise DataError(f"{one.label}: rows share each time stamp, and a stream does not spread them: pass "
                                 f"time=False with dt={dt:g}, or use read.")
             found = uniform_step(stamps, table.how.time_tolerance, one.label)

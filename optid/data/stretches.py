@@ -14,7 +14,7 @@ def runs_of(present: ArrayLike) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(present, dtype=np.int8), [0]]))).reshape(-1, 2)
 
 
-def interpolated(samples: ArrayLike) -> NDArray[np.float64]:
+def interpolate_missing(samples: ArrayLike) -> NDArray[np.float64]:
     """Interpolate missing samples (N, c) linearly by column; zeros where all are missing."""
     filled = np.array(samples, dtype=float)
     for column in filled.T:

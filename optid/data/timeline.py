@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import frozen
+from optid.arrays import read_only
 from optid.data.description import instant
 from optid.errors import DataError
 
@@ -112,7 +112,7 @@ def read_times(times: Any, counts: Sequence[int], dt: float | None
     if dt is None:
         dt = float(f"{np.median(steps):.12g}") if steps.size else 1.0
     even = [bool(np.all(np.abs(one - dt * np.arange(one.size)) <= EVEN * dt)) for one in found]
-    return np.array(starts), kinds.pop(), [None if regular else frozen(one) for one, regular in zip(found, even)], dt
+    return np.array(starts), kinds.pop(), [None if regular else read_only(one) for one, regular in zip(found, even)], dt
 
 
 def seconds_of(end: Any) -> Any:

@@ -8,7 +8,7 @@ _HOME = {
     "rank.hard_over": ["hard_over_test", "HardOver"],
     "whitening": ["whiten", "health", "predictor"],
     "nuisance": ["model_uncertainty"],
-    "directions": ["decoupled", "direction_of"],
+    "directions": ["decouple", "direction_of"],
     "screening": ["flat_lines", "check_channels"],
     "signatures": ["dictionary", "Dictionary", "Candidate"],
     "isolability_study": ["isolability", "Isolability"],

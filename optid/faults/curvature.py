@@ -14,7 +14,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.data.record import Experiment
-from optid.data.stretches import interpolated
+from optid.data.stretches import interpolate_missing
 from optid.faults.whitening import Predictor
 
 
@@ -51,7 +51,7 @@ class Products:
         """Return the response (N, l, K n) of the innovations to unit coefficients, those of a product together."""
         n, (count, l) = len(steady.A), present.shape  # noqa: E741
         span = np.where(self.high > self.low, self.high - self.low, 1.0)
-        z = np.nan_to_num((2 * np.hstack([part.u, interpolated(part.y)]) - self.low - self.high) / span)
+        z = np.nan_to_num((2 * np.hstack([part.u, interpolate_missing(part.y)]) - self.low - self.high) / span)
         into_state = np.zeros((count, n, self.coefficients(n)))
         for number, (i, j) in enumerate(self.pairs):
             product = z[:-1, i] ** 3 if i == j < self.inputs else z[:-1, i] * z[:-1, j]

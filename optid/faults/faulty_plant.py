@@ -60,7 +60,7 @@ class FaultyPlant:
         drawn = np.zeros((count, n + l))
         if present is not None:
             drawn = draw(healthy, count, np.block([[present.Q, present.S], [present.S.T, present.R]]))
-        self.state = model.expanded(u)
+        self.state = model.expand_inputs(u)
         self.output = self.state.copy()
         self.jolt, self.start = np.zeros((count, n)), np.zeros(n)
         self.w, self.sensors = np.ascontiguousarray(drawn[:, :n]), Sensors.healthy(np.ascontiguousarray(drawn[:, n:]))

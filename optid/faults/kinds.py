@@ -13,7 +13,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, LookupFailed, StructureError, nearest
-from optid.registry import registered
+from optid.registry import find_entry_points
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
@@ -164,7 +164,7 @@ class DrivenKind(FaultKind):
         inputs = np.asarray(u, dtype=float).reshape(since.size, -1)
         if inputs.shape[1] != model.m:
             raise DataError(f"u has {inputs.shape[1]} channels; the model has {model.m}.")
-        f = (model.expanded(inputs) - candidate.rest_values(model))[:, list(candidate.columns)]
+        f = (model.expand_inputs(inputs) - candidate.rest_values(model))[:, list(candidate.columns)]
         on = (since >= 0).astype(float)[:, None]
         before = np.vstack([np.zeros((1, f.shape[1])), f[:-1]])  # x(k) is driven by the input before
         begun = on.copy()
@@ -278,7 +278,7 @@ KINDS = {
 @cache
 def all_kinds() -> dict[str, FaultKind]:
     """Return the kinds, those of third parties included, by name."""
-    return {**KINDS, **{name: replace(point.load(), name=name) for name, point in registered(GROUP).items()}}
+    return {**KINDS, **{name: replace(point.load(), name=name) for name, point in find_entry_points(GROUP).items()}}
 
 
 def kind_of(name: str) -> FaultKind:

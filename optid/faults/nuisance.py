@@ -39,7 +39,7 @@ import numpy as np
 
 from optid.arrays import Array, as_list
 from optid.data.record import Data, Experiment
-from optid.data.stretches import interpolated
+from optid.data.stretches import interpolate_missing
 from optid.errors import DataError
 from optid.faults.curvature import Products
 from optid.faults.ranges import outside, unknown_effects
@@ -144,7 +144,7 @@ class ModelUncertainty:
         span = np.where(high > low, high - low, np.inf)  # one reading only is no range
         return minimum_filter1d(np.fmax(np.abs(2 * y - low - high) / span, 1.0), 3, axis=0, mode="nearest")
 
-    def extrapolated(self, y: Array) -> list[str]:
+    def output_range_notes(self, y: Array) -> list[str]:
         """State the outputs whose readings (N, l) leave the range they were identified over, and since when."""
         if self.levels is None:
             return []
@@ -172,7 +172,7 @@ class ModelUncertainty:
         """
 
         def diffuse(changes: Array) -> Array:
-            sizes = np.linalg.norm(self.predictor.flattened(changes, present), axis=0)
+            sizes = np.linalg.norm(self.predictor.whitened_columns(changes, present), axis=0)
             return DIFFUSE * changes[:, :, sizes > 0] / sizes[sizes > 0]
 
         by_parameter, by_start = self.sensitivities(part, x0, present)
@@ -182,9 +182,10 @@ class ModelUncertainty:
         unknown = 0
         if outside(self.model, part.u):
             columns.append(diffuse(self.predictor.respond(*unknown_effects(self.model, part.u), present)))
-            unknown = int(np.linalg.matrix_rank(self.predictor.flattened(columns[-1], present)))
+            unknown = int(np.linalg.matrix_rank(self.predictor.whitened_columns(columns[-1], present)))
         changes = np.concatenate(columns, axis=2)
-        flat = self.predictor.flattened(changes, present) if seen is None else seen(changes).reshape(present.size, -1)
+        flat = self.predictor.whitened_columns(changes,
+                                               present) if seen is None else seen(changes).reshape(present.size, -1)
         U, s, _ = np.linalg.svd(flat, full_matrices=False)
         return Nuisance(U, s, unknown)
 
@@ -271,7 +272,7 @@ def _gathered(model: "HammersteinSS", steady: Predictor, data: Data, curvature: 
     sections: tuple[list[tuple[Array, Array]], ...] = [], []
     length = max(sum(len(part.y) for part in data.experiments) // SECTIONS, 1)
     for part, x0, present, white in _whitened_parts(model, steady, data):
-        by_parameter, by_start = (steady.flattened(effect, present) for effect in
+        by_parameter, by_start = (steady.whitened_columns(effect, present) for effect in
                                   sensitivities(model, steady, part, x0, present, np.eye(size), curvature))
         basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
         basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
@@ -328,7 +329,7 @@ def _operating_point(y: Array) -> Array:
 
     It does not depend on the innovation of a sample, which an order by its output would select.
     """
-    filled = interpolated(y)
+    filled = interpolate_missing(y)
     scaled = filled - filled.mean(axis=0)
     scaled /= np.where(scaled.std(axis=0) > 0, scaled.std(axis=0), 1.0)
     along = scaled @ np.linalg.eigh(scaled.T @ scaled)[1][:, -1]
@@ -447,7 +448,7 @@ def sensitivities(
     columns = np.empty((*present.shape, root.shape[1]))
     for j, (plus, minus, factor) in enumerate(moved_models(model, root)):
         first, second = (
-            simulation.run(simulation.prepared(moved, "predict", part.u, part.y, None, ""), x0)
+            simulation.run(simulation.prepare_run(moved, "predict", part.u, part.y, None, ""), x0)
             for moved in (plus, minus)
         )
         columns[:, :, j] = np.where(present, (second - first) * factor, 0.0)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from optid.faults.signatures import Dictionary
 
 
-def solved(name: str, *arguments: Any, solver: Any = "auto", settings: dict[str, Any] | None = None,
+def solve_registered(name: str, *arguments: Any, solver: Any = "auto", settings: dict[str, Any] | None = None,
            **structure: Any) -> Any:
     """Return the result of a fault formulation by its registered name."""
     from optid.solving.solve import run
@@ -38,7 +38,7 @@ def signature_estimate(found: "Scan", limits: "Thresholds", **how: Any) -> "Spar
     Further arguments are penalty (at one a group is active exactly when the search raises an alarm) and constraints.
     Where the solver fails, the result is not `certified` and its status gives the reason.
     """
-    return solved("fault.signature", found, limits, **how)
+    return solve_registered("fault.signature", found, limits, **how)
 
 
 def membership(
@@ -50,7 +50,7 @@ def membership(
     `faults` are tested, too. Further arguments are onsets, candidates and constraints.
     """
     how |= {} if bounds is None else {"bounds": bounds}
-    return solved("fault.membership", model, data, faults=faults, **how)
+    return solve_registered("fault.membership", model, data, faults=faults, **how)
 
 
 def profile(found: "Scan", label: str, prior: str = "auto", **how: Any) -> "Profile":
@@ -59,4 +59,4 @@ def profile(found: "Scan", label: str, prior: str = "auto", **how: Any) -> "Prof
     The prior is "tv" (steps), "trend" (ramps), "smooth" (random walk), or "auto": the better of the first two by BIC.
     Further arguments are sign, limit, slew, penalties and constraints.
     """
-    return solved("fault.profile", found, label, prior=prior, **how)
+    return solve_registered("fault.profile", found, label, prior=prior, **how)

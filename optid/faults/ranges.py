@@ -89,7 +89,7 @@ def usable_range(model: "HammersteinSS") -> tuple[Array, Array]:
     return low, high
 
 
-def extrapolated(model: "HammersteinSS", u: Array) -> list[str]:
+def input_range_notes(model: "HammersteinSS", u: Array) -> list[str]:
     """State the inputs (N, m) whose linear functions are extrapolated, and since when."""
     (low, high), notes = known_range(model), []
     for column, f in enumerate(model.nonlinearities):

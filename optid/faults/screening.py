@@ -53,12 +53,12 @@ def check_channels(model: "HammersteinSS", data: Data) -> None:
     if energy < 2 * readings:
         return
     _check_order("outputs", data.outputs, energy,
-                 lambda order: _energy(model, raw.mapped(lambda u: u, lambda y: y[:, order])))
+                 lambda order: _energy(model, raw.map_signals(lambda u: u, lambda y: y[:, order])))
     _check_order("inputs", data.inputs, energy,
-                 lambda order: _energy(model, raw.mapped(lambda u: u[:, order], lambda y: y)))
+                 lambda order: _energy(model, raw.map_signals(lambda u: u[:, order], lambda y: y)))
     for (c, name), factor in product(enumerate(data.inputs), FACTORS):
         scale = np.where(np.arange(data.m) == c, 1 / factor, 1.0)
-        trial = _energy(model, raw.mapped(lambda u, s=scale: u * s, lambda y: y))
+        trial = _energy(model, raw.map_signals(lambda u, s=scale: u * s, lambda y: y))
         if trial < BETTER * energy and trial < 2 * readings:
             raise DataError(
                 f"Input {name!r} seems to be in another unit: the record fits the model when it is divided by "

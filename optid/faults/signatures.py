@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.bases import Linear
 from optid.errors import DataWarning, LookupFailed, StructureError, nearest
-from optid.faults.directions import decoupled
+from optid.faults.directions import decouple
 from optid.faults.faults import Fault
 from optid.faults.kinds import FaultKind, all_kinds, kind_of
 from optid.faults.places import channel_of, place_of
@@ -114,7 +114,7 @@ class Candidate:
         """Return the functions of the inputs (r,) at the input without effect, from which a share lost counts."""
         if self.zero is None or self.has_constants:
             return np.zeros(model.B.shape[1])
-        return model.expanded(np.full((1, model.m), self.zero))[0]
+        return model.expand_inputs(np.full((1, model.m), self.zero))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +192,7 @@ class Dictionary:
         readings.
         """
         into_state, into_output = self.additions(candidate, count, onset, u)
-        return self.predictor.whitened(self.predictor.respond(into_state, into_output, present), present)
+        return self.predictor.whiten(self.predictor.respond(into_state, into_output, present), present)
 
     def additions(self, candidate: Candidate | str, count: int, onset: int = 0, u: ArrayLike | None = None
                   ) -> tuple[Array, Array]:
@@ -260,7 +260,7 @@ def dictionary(
     declared = [disturbances] if isinstance(disturbances, str) else list(disturbances)
     steady = predictor(model)
     if declared:
-        model, steady = decoupled(model, declared, process)
+        model, steady = decouple(model, declared, process)
     apart = {name.partition(":")[2] or name for name in declared}
     names = [f"actuator:{c}" for c in _chosen(actuators, model.inputs)]
     names += [f"sensor:{c}" for c in _chosen(sensors, model.outputs)]
@@ -335,7 +335,7 @@ def _horizon(steady: Predictor) -> int:
 def response(steady: Predictor, candidate: Candidate, count: int) -> Array:
     """Return the signature (N, l, d) from the onset on; that of a bias for a candidate without a signature."""
     course = candidate.fault_kind.progress(np.arange(count))[:, None, None]
-    return steady.whitened(steady.respond(course * candidate.into_state, course * candidate.into_output))
+    return steady.whiten(steady.respond(course * candidate.into_state, course * candidate.into_output))
 
 
 def _seen(steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> list[Candidate]:

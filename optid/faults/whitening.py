@@ -12,7 +12,7 @@ from optid.errors import DataError, DataWarning, StructureError
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
-from optid.models.recursions import SHORT, propagated
+from optid.models.recursions import SHORT, propagate
 from optid.models.roots import spectral_radius
 from optid.phrases import p_value
 
@@ -82,7 +82,7 @@ class Predictor:
         if A is None and len(into_output) <= SHORT and (present is None or present.all()):
             drive = into_state.copy()
             drive[1:] -= self.K @ into_output[:-1]
-            return into_output + self.C @ propagated(self.F, drive)
+            return into_output + self.C @ propagate(self.F, drive)
         from optid.faults import kernels
 
         shown = np.ones(into_output.shape[:2], dtype=bool) if present is None else present
@@ -97,7 +97,7 @@ class Predictor:
         into_state[onset] = np.eye(n)
         return self.respond(into_state, np.zeros((count, l, n)), present)
 
-    def whitened(self, innovations: Array, present: Array | None = None) -> Array:
+    def whiten(self, innovations: Array, present: Array | None = None) -> Array:
         """Return whitened innovations (N, l) or (N, l, d), zero where a reading is missing.
 
         The remaining readings of a sample are whitened by the covariance among themselves.
@@ -113,9 +113,9 @@ class Predictor:
                 result[np.ix_(rows, there)] = np.einsum("ij,nj...->ni...", block, innovations[np.ix_(rows, there)])
         return result
 
-    def flattened(self, changes: Array, present: Array) -> Array:
+    def whitened_columns(self, changes: Array, present: Array) -> Array:
         """Return changes (N, l, d) of the innovations, whitened, as columns (N l, d)."""
-        return self.whitened(changes, present).reshape(present.size, -1)
+        return self.whiten(changes, present).reshape(present.size, -1)
 
 
 def predictor(model: "HammersteinSS") -> Predictor:
@@ -213,9 +213,9 @@ class Whitened:
     nuisance: Nuisance | None = None
     states: Array | None = None
 
-    def seen(self, signature: Array) -> Array:
+    def whiten_signature(self, signature: Array) -> Array:
         """Return a signature (N, l, d) of the innovations, whitened like r."""
-        white = self.predictor.whitened(signature, self.present)
+        white = self.predictor.whiten(signature, self.present)
         return white if self.nuisance is None else self.nuisance(white)
 
 
@@ -281,9 +281,9 @@ def whiten(
     found = []
     for part, prediction, start in zip(raw.experiments, predictions, starts):
         present, start = ~np.isnan(part.y), np.asarray(start, dtype=float)
-        states = simulation.visited(simulation.prepared(gained, "predict", part.u, part.y, None, ""), start)
+        states = simulation.run_states(simulation.prepare_run(gained, "predict", part.u, part.y, None, ""), start)
         innovations = part.y - prediction
-        r = steady.whitened(np.where(present, innovations, 0.0), present)
+        r = steady.whiten(np.where(present, innovations, 0.0), present)
         white = Whitened(r, innovations, present, steady, model.outputs, states=states)
         if uncertainty is not None:
             nuisance = uncertainty.nuisance(part, start, present, free_start=fitted)

@@ -87,7 +87,7 @@ class Blocks:
             cut = [x for part in self.parts[block] if part.experiment == i for x in part[1:]]
             borders = [0, *cut, e.n_samples]
             kept += [RepeatedPart(i, int(a), int(b)) for a, b in zip(borders[::2], borders[1::2]) if b - a >= SHORTEST]
-        return joined(self.data, kept)
+        return join_parts(self.data, kept)
 
     @cached_property
     def outputs(self) -> tuple[Array, Array]:
@@ -150,7 +150,7 @@ class Blocks:
         samples = self.data.experiments[part.experiment].n_samples
         length = min(WIDER * (part.last - part.first), samples)
         first = min(max((part.first + part.last - length) // 2, 0), samples - length)
-        return between_gaps(joined(self.data, [RepeatedPart(part.experiment, first, first + length)]), 2).raw()
+        return between_gaps(join_parts(self.data, [RepeatedPart(part.experiment, first, first + length)]), 2).raw()
 
     def _diverges(self, model: Any, block: int) -> bool:
         """Whether a model with a state fitted to the first third of a block diverges in the rest of it.
@@ -158,7 +158,7 @@ class Blocks:
         A state fitted to the whole simulation hides an unstable mode.
         """
         try:
-            part = between_gaps(joined(self.data, self.parts[block]), 2).raw()
+            part = between_gaps(join_parts(self.data, self.parts[block]), 2).raw()
             states = [_leading_state(model, part, i) for i in range(part.n_experiments)]
             runs = as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
         except OptidError:
@@ -233,10 +233,10 @@ def stretches(data: Data, most: int, count: int = 5) -> Data:
         part = RepeatedPart(i, first, first + length)
         if part not in kept:
             kept.append(part)
-    return joined(data, kept)
+    return join_parts(data, kept)
 
 
-def joined(data: Data, parts: Iterable[RepeatedPart]) -> Data:
+def join_parts(data: Data, parts: Iterable[RepeatedPart]) -> Data:
     """Return parts of a record as experiments."""
     return Data.join(*(data.select(experiments=p.experiment).window(p.first, p.last) for p in parts))
 

@@ -97,7 +97,7 @@ class Fit(Rendered):
     def _completed(self) -> tuple[Any, dict[str, Any]]:
         evidence = self.outcome.evidence
         try:
-            model, figures = evidence.extended() if evidence else (self.outcome.model, {})
+            model, figures = evidence.run_extension() if evidence else (self.outcome.model, {})
             return _in_raw_units(model, self.data), {**self.outcome.figures, **figures}
         except OptidError as reason:  # of the noise model: the model alone was accepted by `fit`
             model, figures = self.outcome.model, {"noise model": f"none: {reason}"}
@@ -119,7 +119,7 @@ class Fit(Rendered):
         if not self.solution.has_point:
             return {}
         problem: Problem = self.program.core
-        return problem.shown({name: self.solution.values[name] for name in problem.start})
+        return problem.named_quantities({name: self.solution.values[name] for name in problem.start})
 
     @cached_property
     def one_step_fit(self) -> np.ndarray:

@@ -15,7 +15,7 @@ from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.data.repeats import RepeatedPart
 from optid.errors import RankError
-from optid.identify.blocks import Blocks, joined
+from optid.identify.blocks import Blocks, join_parts
 from optid.statistics import Layout, Statistics, accumulate
 
 Places = NDArray[np.intp]
@@ -56,7 +56,7 @@ class LagSums:
         long = [p for p in parts if p.last - p.first > self.layout.first_row]
         if not long:
             raise RankError(f"no block is longer than {self.layout.first_row} lags")
-        return accumulate(joined(self.data, long), self.layout)
+        return accumulate(join_parts(self.data, long), self.layout)
 
     def columns(self, na: int, nb: int, nk: tuple[int, ...]) -> Places:
         """Return the columns of a smaller structure."""

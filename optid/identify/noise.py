@@ -24,7 +24,7 @@ from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
 from optid.lazy import public_names
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import Likelihood, OneStepPredictor, covariance_of, refined
+from optid.models.innovation_gain import Likelihood, OneStepPredictor, covariance_of, refine_gain
 from optid.models.kalman import NoiseCovariances, kalman_gain
 from optid.models.roots import spectral_radius
 from optid.models.state_space import StateSpace
@@ -145,12 +145,12 @@ def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> OneStepPredictor:
     part, whole = Likelihood(A, C, _part(rest, C.size)), Likelihood(A, C, rest)
     starts = _starts(part)[:TRIED]
     if part.rest is rest:
-        found = [refined(part, start) for start in starts]
+        found = [refine_gain(part, start) for start in starts]
     else:
-        found = sorted((refined(part, start, arrived=NEARLY) for start in starts), key=LIKELIEST)
+        found = sorted((refine_gain(part, start, arrived=NEARLY) for start in starts), key=LIKELIEST)
         same = found[0].log_determinant + 2 * ELSEWHERE / sum(map(len, part.rest))
         optima = [found[0], *(other for other in found[1:] if other.log_determinant > same)]
-        found = [refined(whole, whole.at(optimum.gain), part) for optimum in optima]
+        found = [refine_gain(whole, whole.at(optimum.gain), part) for optimum in optima]
     return min(found, key=LIKELIEST)
 
 

@@ -14,7 +14,7 @@ from optid.core.problem import Problem
 from optid.core.terms import Values
 from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
-from optid.data.stretches import interpolated, with_whole_inputs
+from optid.data.stretches import interpolate_missing, with_whole_inputs
 from optid.errors import RankError, StructureError
 from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.criterion import Criterion
@@ -22,7 +22,7 @@ from optid.identify.tangent import constraint_rows
 from optid.models.equations import Equations
 from optid.models.physical import PhysicalModel, Runs
 from optid.program.compressed import Spread
-from optid.statistics.linearised import Linearised, Method, linearised
+from optid.statistics.linearised import Linearised, Method, linearise_errors
 from optid.statistics.unknowns import Unknowns
 
 NO_EFFECT = 1e-7  # relative singular value of the scaled sensitivities below which parameters are not identifiable
@@ -96,7 +96,7 @@ class PhysicalErrors(Criterion):
     @cached_property
     def _evaluated(self) -> dict[str, Any]:
         named = {one.name(): one for group in self._scalars for one in group}
-        found = self.equations.evaluated(named, self.data.outputs)
+        found = self.equations.evaluate(named, self.data.outputs)
         used = {one.id for value in found.values() if isinstance(value, cp.Expression) for one in value.variables()}
         if idle := [one.name() for one in self._scalars[2] if one.id not in used]:
             raise StructureError(f"no equation uses the parameter {idle[0]!r}: use it, or leave it out")
@@ -186,13 +186,13 @@ class PhysicalErrors(Criterion):
         """Return the errors near x; of infinite size where they or their sensitivities are not finite."""
         unknowns, rows, infinite = self.unknowns, self.rows(x), []
 
-        def bounded(i: int) -> Iterator[tuple[Array, int]]:
+        def bounded_blocks(i: int) -> Iterator[tuple[Array, int]]:
             for block, count in rows(i):
                 finite = np.abs(block) < LIMIT
                 infinite.extend([i] * (not finite.all()))
                 yield np.where(finite, block, 0.0), count
 
-        found = linearised(bounded, unknowns.experiments, unknowns.n, unknowns.shared, method=method)
+        found = linearise_errors(bounded_blocks, unknowns.experiments, unknowns.n, unknowns.shared, method=method)
         return replace(found, remainder=np.inf) if infinite else found
 
     def value(self, x: Array) -> float:
@@ -219,7 +219,7 @@ class PhysicalErrors(Criterion):
         """One unit of the weighted errors in squared units of the output; one for several outputs."""
         return float(1 / self.weight[0, 0]) if self.data.l == 1 else 1.0
 
-    def reweighted(self, x: Array) -> "PhysicalErrors":
+    def reweight(self, x: Array) -> "PhysicalErrors":
         """Return the errors weighted by their inverse variances at x."""
         variances = np.nanmean(np.vstack(self.residuals(x)) ** 2, axis=0)
         return replace(self, weight=np.diag(1 / np.maximum(variances, FLOOR / np.diag(self.weight))))
@@ -232,7 +232,7 @@ class PhysicalErrors(Criterion):
         at = np.arange((len(u) - 1) * apart + 1) / apart
         return np.column_stack([np.interp(at, np.arange(len(u)), column) for column in u.T])
 
-    def visited(self, i: int, x0: Array, p: Array) -> Array:
+    def run_states(self, i: int, x0: Array, p: Array) -> Array:
         """Return the states (G, n) of a run of an experiment at the steps of integration."""
         apart = max(self.steps, 1)
         fine = Runs.of(self.code, self.bounds, min(self.steps, 1), self.equations.hold, self.data.dt / apart)
@@ -264,7 +264,7 @@ class PhysicalErrors(Criterion):
         p = np.array(list(self.equations.parameters.values()), dtype=float)
         found = np.vstack([visited for visited, _ in self.runs.over(e.u, given, p)])
         found = np.where(np.isfinite(found).all(axis=1, keepdims=True), found, given)
-        seen = interpolated(e.y)
+        seen = interpolate_missing(e.y)
         for j, name in enumerate(states):
             if name in self.measured:
                 found[:, j] = seen[:, self.measured[name]]

@@ -45,7 +45,7 @@ def without_outliers(data: Data, figures: Mapping[str, Any]) -> Data:
         for y, samples in zip(columns, one.samples):
             y[samples, data.outputs.index(one.output)] = np.nan
     kept = iter(columns)
-    return data.mapped(lambda u: u, lambda y: next(kept))
+    return data.map_signals(lambda u: u, lambda y: next(kept))
 
 
 def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | None = None) -> list[str]:

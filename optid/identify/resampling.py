@@ -14,11 +14,11 @@ import numpy as np
 from optid.arrays import Array, check_integer, check_probability
 from optid.data.record import Data
 from optid.data.streams import Stream
-from optid.data.stretches import interpolated
+from optid.data.stretches import interpolate_missing
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.fitting import Fit
 from optid.identify.fitting import fit as refit
-from optid.identify.uncertainty import Refits, Uncertainty, aligned
+from optid.identify.uncertainty import Refits, Uncertainty, align_signs
 from optid.models import HammersteinTF
 from optid.models.functions import free_parameters
 from optid.models.recursions import autoregression
@@ -80,7 +80,7 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
             if again.model is None:
                 failed += 1
             else:
-                models.append(aligned(again.model, fit.model))
+                models.append(align_signs(again.model, fit.model))
     if failed > FAILED * runs:
         warnings.warn(f"{failed} of {runs} refits gave no point and are left out", DataWarning, stacklevel=2)
     if len(models) < 2:
@@ -103,14 +103,14 @@ def _records(fit: Fit, runs: int, seed: int) -> Iterator[Data]:
     for _ in range(runs):
         outputs = iter([_simulated(own, e.u, e.y, residuals[rng.integers(len(residuals), size=len(e.y))])
                         for own, e in zip(models, data.experiments)])
-        yield data.mapped(lambda u: u, lambda _, outputs=outputs: next(outputs))
+        yield data.map_signals(lambda u: u, lambda _, outputs=outputs: next(outputs))
 
 
 def _simulated(model: HammersteinTF, u: Array, y: Array, errors: Array) -> Array:
     """Outputs of A y = B f(u) + d + errors with the first and the missing samples of the record."""
     n = model.largest_lag
-    u, start = interpolated(u), interpolated(y)[:n]
-    right = model.driven(u[n:]) + errors[n:]
+    u, start = interpolate_missing(u), interpolate_missing(y)[:n]
+    right = model.forcing(u[n:]) + errors[n:]
     state = model.following(u[:n], start)
     count = min(n, len(right))
     right[:count] += state[:count]

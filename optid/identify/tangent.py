@@ -157,9 +157,9 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
     point = {name: found[name] for name in problem.start}
     equalities, inequalities, slack = constraint_rows(problem, point, tuple(shapes))
 
-    lift, lifted = differences(lambda x: compressed.lifted(_unpacked(shapes, x)), x)
+    lift, lifted = differences(lambda x: compressed.lift(_unpacked(shapes, x)), x)
     squares = compressed.problem
-    free, triangle, basis = whitened(squares.root @ lift, equalities, shapes)
+    free, triangle, basis = whiten_directions(squares.root @ lift, equalities, shapes)
     directions = free @ np.linalg.inv(triangle)
     pull = basis.T @ (squares.root @ lifted - squares.target)
     centre = -pull if len(slack) else np.zeros_like(pull)
@@ -173,7 +173,7 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
     scale = np.ones(len(spread.noise)) if transform is None else np.array(transform.y_scale)
     criterion = getattr(compressed, "criterion", None)
     objective = None if criterion is None else lambda values: (
-        criterion.value(z) if criterion.admissible(z := compressed.lifted(values)) else np.inf)
+        criterion.value(z) if criterion.admissible(z := compressed.lift(values)) else np.inf)
     return Tangent(rebuild, shapes, x, directions, local, problem.unit * spread.noise * np.outer(scale, scale),
                    kind, spread.words, objective)
 
@@ -202,7 +202,8 @@ def _refuse(fit: Any) -> None:
                              "'hammerstein_arx.exact', or use optid.bootstrap for the scatter about the shrunk value")
 
 
-def whitened(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...]]) -> tuple[Array, Array, Array]:
+def whiten_directions(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...]]) -> tuple[Array, Array,
+                                                                                                     Array]:
     """Return (free directions, R, Q) with effect @ free = Q R; unknowns without effect are a `RankError` by name."""
     sizes = np.linalg.norm(effect, axis=0)
     for name, part in _unpacked(shapes, sizes).items():

@@ -19,7 +19,7 @@ from optid.bases.expansions import Linear
 from optid.errors import DataError, StructureError
 from optid.identify.intervals import DRAWS
 from optid.identify.tangent import Quantity, Tangent, linearise
-from optid.models.state_simulation import prepared, visited
+from optid.models.state_simulation import prepare_run, run_states
 from optid.threads import one_thread
 
 
@@ -240,7 +240,7 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
         model = fit.program.recover(values)
         for transform in filter(None, transforms):
             model = model.with_transform(transform)
-        return aligned(model, fit.model)
+        return align_signs(model, fit.model)
 
     source = linearise(fit, rebuild, draws, seed)
     _ = source.neighbours  # so that models which cannot be differentiated are refused here, not by a table of them
@@ -256,13 +256,13 @@ def _mean_state(model: Any, experiments: Sequence[Any]) -> Array | None:
     """Return the mean state (n,) of a free run over the longest experiment; None where there is none."""
     try:
         u = max((e.u for e in experiments), key=len)
-        return visited(prepared(model, "free", u, None, None, ""), np.zeros(model.nx)).mean(axis=0)
+        return run_states(prepare_run(model, "free", u, None, None, ""), np.zeros(model.nx)).mean(axis=0)
     except DataError:
         return None
 
 
-def aligned(model: Any, reference: Any) -> Any:
+def align_signs(model: Any, reference: Any) -> Any:
     """Give every f and B of a model the sign nearest to that of a reference; predictions do not change."""
     signs = np.array([-1.0 if float(np.sum(f.mu * other.mu)) < 0 else 1.0
                       for f, other in zip(model.nonlinearities, reference.nonlinearities)])
-    return model if np.all(signs > 0) else model.turned(signs)
+    return model if np.all(signs > 0) else model.with_signs(signs)

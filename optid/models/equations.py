@@ -86,7 +86,7 @@ class Equations:
                                  "time")
         return round(count)
 
-    def evaluated(self, v: Mapping[str, Any], outputs: tuple[str, ...]) -> dict[str, Any]:
+    def evaluate(self, v: Mapping[str, Any], outputs: tuple[str, ...]) -> dict[str, Any]:
         """Return the values of states and outputs; refuse unknown or missing names (`StructureError`)."""
         found = self.right(_Named(v))
         if not isinstance(found, Mapping):

@@ -8,7 +8,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import OptidError, StructureError, nearest
-from optid.models.feedback_tables import CELLS, FREE, LEGENDRE, LINEAR, USER, tabulated
+from optid.models.feedback_tables import CELLS, FREE, LEGENDRE, LINEAR, USER, tabulate
 from optid.models.nonlinearity import Nonlinearity
 
 DROPPED = 1e-14  # leading coefficients of a numerator that SciPy takes for zero
@@ -133,7 +133,7 @@ def symbolic(nonlinearity: Nonlinearity, u: Any) -> Any:
     """
     import casadi as ca
 
-    tables = tabulated([nonlinearity])
+    tables = tabulate([nonlinearity])
     kind, low, high, numbers = tables.kind[0], float(tables.low[0]), float(tables.high[0]), tables.numbers[0]
     if kind == USER and not tables.outside[0] == LINEAR:
         return _called(nonlinearity, u if tables.outside[0] == FREE else ca.fmin(ca.fmax(u, low), high))

@@ -38,7 +38,7 @@ class Tables(NamedTuple):
         return bool(np.all(self.kind != USER))
 
 
-def tabulated(functions: Sequence[Nonlinearity]) -> Tables:
+def tabulate(functions: Sequence[Nonlinearity]) -> Tables:
     """Write nonlinearities as tables; their values and slopes are those of `Nonlinearity` to rounding."""
     rows = [_row(f) for f in functions]
     width = max((r[-1].shape[0] for r in rows), default=1)

@@ -27,7 +27,8 @@ class HammersteinSS(StateSpace):
         return (self.with_level_states.nx,)
 
     def _predicted(self, u: Array, y: Array, horizon: int, state: Array, label: str) -> Array:
-        return simulation.run(simulation.prepared(self.with_level_states, "predict", u, y, None, label), state, horizon)
+        return simulation.run(simulation.prepare_run(self.with_level_states, "predict", u, y, None, label), state,
+                              horizon)
 
     def simulate_measured_feedback(self, data: Data, x0: Any = "zero") -> Any:
         """Simulate with the measured outputs in the feedback (P2), without correcting the state; see `simulate`.
@@ -41,15 +42,15 @@ class HammersteinSS(StateSpace):
         states, limits = self._states(simulator, records, x0), simulation.allowed_range([y for _, y, _ in records])
         if not self.feedback and not np.any(self.L):
             self._warn_unstable()
-        return [simulation.run(simulation.prepared(self.with_level_states, simulator, u, y, limits, label), x)
+        return [simulation.run(simulation.prepare_run(self.with_level_states, simulator, u, y, limits, label), x)
                 for (u, y, label), x in zip(records, states)]
 
     def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:
         """Fit the initial state of one record; a free run with feedback starts from the value of P2, or from rest."""
         limits = simulation.allowed_range([y]) if self.feedback and simulator != "predict" else None
-        run = simulation.prepared(self.with_level_states, simulator, u, y, limits, label)
+        run = simulation.prepare_run(self.with_level_states, simulator, u, y, limits, label)
         if self.feedback and simulator == "free":
-            measured = simulation.prepared(self, "measured_feedback", u, y, None, label)
+            measured = simulation.prepare_run(self, "measured_feedback", u, y, None, label)
             try:
                 return simulation.fitted_state(run, y, simulation.fitted_state(measured, y))
             except DataError:
@@ -64,9 +65,9 @@ class HammersteinSS(StateSpace):
         records = records_of(self, data)[0]
         limits = simulation.allowed_range([y for _, y, _ in records])
         model = self.with_level_states
-        runs = [simulation.prepared(model, "free", u, y, limits, label) for u, y, label in records]
+        runs = [simulation.prepare_run(model, "free", u, y, limits, label) for u, y, label in records]
         states = self._states("free", records, "fit")
-        return [model.latent_signals(simulation.visited(run, x), run.u) for run, x in zip(runs, states)]
+        return [model.latent_signals(simulation.run_states(run, x), run.u) for run, x in zip(runs, states)]
 
 
 KINDS["HammersteinSS"] = HammersteinSS.from_dict

@@ -111,7 +111,7 @@ class HammersteinTF(Model):
         if largest >= 1:
             raise StructureError(
                 f"C is not invertible: it has a zero of modulus {largest:.6g}. Reflect it into the unit circle "
-                "(optid.models.roots.contained): the spectrum of the noise stays what it is.")
+                "(optid.models.roots.contain_roots): the spectrum of the noise stays what it is.")
 
     # -- sizes and noise -----------------------------------------------------------------------------------------
 
@@ -220,11 +220,11 @@ class HammersteinTF(Model):
         """Return 1 for every input with whose function the output rises, -1 where it falls; see `plant_signs`."""
         return np.array([plant_sign(self.a, b) for b in self.b])
 
-    def turned(self, signs: ArrayLike) -> Self:
+    def with_signs(self, signs: ArrayLike) -> Self:
         """Multiply f and B of every input by its sign (m,), 1 or -1; predictions do not change."""
         pairs = list(zip(np.asarray(signs, dtype=float), self.b, self.nonlinearities))
         return replace(self, b=tuple(sign * b for sign, b, _ in pairs),
-                       nonlinearities=tuple(f.scaled(sign) for sign, _, f in pairs))
+                       nonlinearities=tuple(f.times(sign) for sign, _, f in pairs))
 
     def _static_gain(self, points: Array) -> Array:
         return self._at_rest(self.numerators.sum(axis=0) * [f.slope(u) for f, u in zip(self.nonlinearities, points)])
@@ -268,7 +268,7 @@ class HammersteinTF(Model):
         if gauge == "norm" and not signs:
             scales = [abs(scale) for scale in scales]
         return replace(self, b=tuple(b / s for b, s in zip(self.b, scales)), gauge=gauge,
-                       nonlinearities=tuple(f.scaled(s) for f, s in zip(self.nonlinearities, scales)))
+                       nonlinearities=tuple(f.times(s) for f, s in zip(self.nonlinearities, scales)))
 
     def _in_raw_units(self, transform: Transform) -> Self:
         gain, shift = np.array(transform.y_scale), np.array(transform.y_offset)
@@ -277,7 +277,7 @@ class HammersteinTF(Model):
         offset = gain * self.offset + shift + a.reshape(self.matrices.shape).sum(axis=0) @ shift
         functions = []
         for f, rows, scale, origin in zip(self.nonlinearities, b, transform.u_scale, transform.u_offset):
-            moved, constant = f.mapped(scale, origin)
+            moved, constant = f.in_units(scale, origin)
             functions.append(moved)
             offset = offset + constant * rows.sum(axis=0)
         levels = None if self.levels is None else offset + gain * (self.levels - self.offset)
@@ -301,7 +301,7 @@ class HammersteinTF(Model):
         """Predict one record in raw units; see `predict`. The arguments are those of `Model.predict_record`."""
         if self.structure not in ("arx", "armax"):
             return super().predict_record(u, y, horizon, x0, label)
-        drive = self.driven(u)
+        drive = self.forcing(u)
         if self.levels is not None:
             drive = drive + (self._fitted_level(drive, y) if x0 is None else x0[-1])
         return self._stateless(drive, y, horizon)
@@ -331,7 +331,7 @@ class HammersteinTF(Model):
         found = recursions.innovations(s[:, 0], None if drive is None else drive[:, 0], c, d, start)
         return recursions.predict(found, c, d, horizon)[:, None]
 
-    def driven(self, u: Array) -> Array:
+    def forcing(self, u: Array) -> Array:
         """Return the right-hand side sum_c B_c(q) f_c(u_c) + offset, (N, l), with nothing before the record."""
         right, f = np.tile(self.offset, (len(u), 1)), [f(one) for f, one in zip(self.nonlinearities, u.T)]
         for lag, c in np.argwhere(self.numerators[: len(u)].any(axis=1)):
@@ -350,7 +350,7 @@ class HammersteinTF(Model):
             DataError: a missing input, or an output that leaves the range of numbers; named by channel and sample.
         """
         check_inputs(self, u, label)
-        n, right = self.largest_lag, self.driven(u)
+        n, right = self.largest_lag, self.forcing(u)
         right[:n] += state[: min(n, len(right))]
         right += state[n:].sum(axis=0)
         y = autoregression(self.matrices, right)

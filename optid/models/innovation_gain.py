@@ -15,7 +15,7 @@ import numpy as np
 
 from optid.arrays import Array, compact
 from optid.errors import DataError, StructureError
-from optid.models.feedback_tables import tabulated
+from optid.models.feedback_tables import tabulate
 from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius
 from optid.models.state_signals import Direct, Parts, Signals, Stretch
@@ -26,7 +26,7 @@ FIRM = 0.01
 ARRIVED = 2e-5  # negligible gain of the log-likelihood; half a unit is one standard error of a parameter
 NUMBERS = 200_000  # entries of the sensitivities formed at a time
 TINY = np.finfo(float).tiny
-NO_FUNCTIONS = tabulated(())
+NO_FUNCTIONS = tabulate(())
 
 
 class OneStepPredictor(NamedTuple):
@@ -83,7 +83,8 @@ class Likelihood:
         return total[:-1, :-1], -total[:-1, -1]
 
 
-def refined(likelihood: Likelihood, found: OneStepPredictor, part: Likelihood | None = None, arrived: float = ARRIVED
+def refine_gain(likelihood: Likelihood, found: OneStepPredictor, part: Likelihood | None = None,
+                arrived: float = ARRIVED
             ) -> OneStepPredictor:
     """Return the predictor whose gain minimises the determinant of the covariance of its innovations.
 

@@ -51,7 +51,7 @@ class NoiseCovariances:
         """Return those of ``w = K e, v = e`` for the gain K (n, l) and the covariance (l, l) of the innovations e."""
         return cls(_congruent(gain, covariance), covariance, gain @ covariance, covariance)
 
-    def mapped(self, states: Array, outputs: Array) -> "NoiseCovariances":
+    def transform(self, states: Array, outputs: Array) -> "NoiseCovariances":
         """Return the covariances of T x and G y for ``states`` T (n, n) and ``outputs`` G (l, l)."""
         return NoiseCovariances(_congruent(states, self.Q), _congruent(outputs, self.R), states @ self.S @ outputs.T,
                                 _congruent(outputs, self.innovation))

@@ -84,7 +84,7 @@ class Layout(Ports):
         """Length of a complete row."""
         return self.na * self.l + sum(b * basis.full_size for b, basis in zip(self.nb, self.bases)) + 1 + self.l
 
-    def contrasted(self, complete: Array) -> Array:
+    def reduce_rows(self, complete: Array) -> Array:
         """Turn complete rows (K, n_complete) into rows of [Phi | Y], (K, n_columns + l)."""
         past, count = self.na * self.l, len(complete)
         parts = [-complete[:, :past]]

@@ -63,16 +63,16 @@ class Nonlinearity:
         """The factor that turns a linear f into f(u) = u; one for every other."""
         return 1 / float(self.mu[0]) if self.is_linear and self.mu[0] != 0 else 1.0
 
-    def scaled(self, factor: float) -> "Nonlinearity":
+    def times(self, factor: float) -> "Nonlinearity":
         """Return factor times f, the offset as it is."""
         return replace(self, mu=factor * self.mu)
 
-    def mapped(self, scale: float, offset: float) -> tuple["Nonlinearity", float]:
+    def in_units(self, scale: float, offset: float) -> tuple["Nonlinearity", float]:
         """Express f in the units v = scale u + offset: f(u) = g(v) + c; return g and c.
 
         A basis of UserFunctions keeps its units and is refused (`StructureError`).
         """
-        basis, matrix, constant = self.basis.mapped(scale, offset)
+        basis, matrix, constant = self.basis.in_units(scale, offset)
         return Nonlinearity(basis, matrix @ self.mu), float(constant @ self.mu)
 
     def to_dict(self) -> dict[str, Any]:

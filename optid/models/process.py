@@ -347,8 +347,8 @@ class ProcessModel(Model):
         sizes, curves = np.array(transform.y_scale), []
         shift = np.array(transform.y_offset)
         for (o, c), one, f in zip(self.pairs, self.processes, self.nonlinearities):
-            curve, constant = f.mapped(transform.u_scale[c], transform.u_offset[c])
-            curves.append(curve.scaled(sizes[o]))
+            curve, constant = f.in_units(transform.u_scale[c], transform.u_offset[c])
+            curves.append(curve.times(sizes[o]))
             shift[o] += sizes[o] * constant * (not one.structure.integrator)
         levels = None if self.levels is None else shift + sizes * self.levels
         return replace(self, nonlinearities=tuple(curves), level=shift + sizes * self.level, drift=sizes * self.drift,

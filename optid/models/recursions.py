@@ -58,7 +58,7 @@ def all_pole(a: Array, x: Array) -> Array:
         return solve(band, x, uplo="L", diag="U")[0]
 
 
-def propagated(matrix: Array, drive: Array) -> Array:
+def propagate(matrix: Array, drive: Array) -> Array:
     """Return the states (N, n, d) of x(k) = matrix x(k-1) + drive(k), from rest; N is at most `SHORT`.
 
     They solve a banded triangular system.

@@ -79,13 +79,13 @@ def with_roots(roots: Any, size: int) -> Array:
     return found
 
 
-def pulled(coefficients: Array, limit: float) -> Array:
+def pull_roots(coefficients: Array, limit: float) -> Array:
     """Return the coefficients with every root outside the circle of radius ``limit`` pulled back onto it."""
     roots = roots_of(coefficients)
     return with_roots(roots * (limit / np.maximum(np.abs(roots), max(limit, 1e-300))), len(coefficients))
 
 
-def contained(coefficients: Array, limit: float = np.inf) -> Array:
+def contain_roots(coefficients: Array, limit: float = np.inf) -> Array:
     """Return the coefficients with roots outside the unit circle reflected, and none outside a radius ``limit``.
 
     Where the limit moves none, the spectrum of C e keeps its shape (spectral factorisation).

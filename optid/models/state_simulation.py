@@ -13,7 +13,7 @@ import numpy as np
 from optid.arrays import Array, compact
 from optid.errors import DataError
 from optid.models.experiments import check_inputs, scaled_least_squares, signal_units
-from optid.models.recursions import SHORT, propagated
+from optid.models.recursions import SHORT, propagate
 from optid.models.state_signals import Direct, Parts, Signals, Stretch
 from optid.models.state_space import StateSpace
 
@@ -46,7 +46,7 @@ class Run(NamedTuple):
     label: str  # words that name the experiment in a message
 
 
-def prepared(model: StateSpace, simulator: str, u: Array, y: Array | None, limits: Any, label: str) -> Run:
+def prepare_run(model: StateSpace, simulator: str, u: Array, y: Array | None, limits: Any, label: str) -> Run:
     """Return what a simulator, "predict" (P1), "measured_feedback" (P2) or "free" (P3), runs over.
 
     Outputs y (N, l) may be None for P3 only, the limits (low, high), each (l,), from `allowed_range`, None for the
@@ -89,7 +89,7 @@ def run(job: Run, x0: Array, horizon: int = 1) -> Array:
     return outputs
 
 
-def visited(job: Run, x0: Array) -> Array:
+def run_states(job: Run, x0: Array) -> Array:
     """Compute the states (N, n) of a run; errors as `run`."""
     x, starts = np.array(x0, dtype=float), range(0, len(job.u), STRETCH)
     return np.vstack([march(job, k, stretch_of(job, slice(k, k + STRETCH)), x)[0] for k in starts])
@@ -116,7 +116,7 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
     found, cost = _descended(job, y, unit, x)
     if _begins_badly((y - run(job, found)) / unit):
         with suppress(DataError):
-            other, lower = _descended(job, y, unit, _from_beginnings(job, y, unit, [x, *_some(visited(job, found))]))
+            other, lower = _descended(job, y, unit, _from_beginnings(job, y, unit, [x, *_some(run_states(job, found))]))
             return other if lower < cost else found
     return found
 
@@ -222,7 +222,7 @@ def _by_start(job: Run, first: int, stretch: Stretch, states: Array, simulated: 
         F, drive = model.A - job.gain @ model.C, np.zeros((len(states), *turn.shape))
         drive[0] = turn
         with np.errstate(all="ignore"):
-            moved = propagated(F, drive)
+            moved = propagate(F, drive)
             return model.C @ moved, F @ moved[-1]
     from optid.models.state_kernels import sensitivities
 
@@ -251,7 +251,7 @@ def allowed_range(data: Any, times: float = FAR) -> Any:
 def stretch_of(job: Run, samples: slice, f: Array | None = None) -> Stretch:
     """Return what drives some samples of a run; ``f`` (T, r) are the values of the nonlinearities where known."""
     model, u = job.model, job.u[samples]
-    f = model.expanded(u) if f is None else f
+    f = model.expand_inputs(u) if f is None else f
     y = np.full((len(u), model.l), np.nan) if job.known is None else job.known[samples]
     g = np.empty((len(u), len(model.feedback)))
     for j, (function, o) in enumerate(zip(model.feedback, model.output_of)):
@@ -274,7 +274,7 @@ def signals(job: Run, stretch: Stretch, states: Array, outputs: Array) -> Signal
             slopes[:, j] = h.slope(z[:, j])
     returned = np.zeros((0, model.nx, model.l))
     if np.any(job.gain) or (missing.any() and (model.feedback or np.any(model.L))):
-        own = model.returned(outputs) if missing.any() else 0.0
+        own = model.output_feedback(outputs) if missing.any() else 0.0
         returned = np.where(missing[:, None, :], own, -job.gain)
     return Signals(compact(returned), slopes, np.zeros((len(states), 0)))
 

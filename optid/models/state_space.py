@@ -15,7 +15,7 @@ from optid.data.channels import Transform
 from optid.errors import StructureError
 from optid.models import roots
 from optid.models.equilibria import equilibria
-from optid.models.feedback_tables import tabulated
+from optid.models.feedback_tables import tabulate
 from optid.models.gauges import plant_signs
 from optid.models.kalman import NoiseCovariances
 from optid.models.model import Model, frequency_response, impulse_response, static_solution
@@ -163,10 +163,10 @@ class StateSpace(Model):
     def parts(self) -> Parts:
         """Matrices and tables as the compiled recursions read them."""
         matrices = [np.array(getattr(self, name), order="C") for name in Parts._fields[:-2]]
-        functions = tabulated([*self.feedback, *self.latent])
+        functions = tabulate([*self.feedback, *self.latent])
         return Parts._make([*matrices, np.array(self.output_of, dtype=np.int64), functions])
 
-    def expanded(self, u: Array) -> Array:
+    def expand_inputs(self, u: Array) -> Array:
         """Return the values of the r nonlinearities at the inputs u (N, m), (N, r)."""
         columns = [f(u[:, c]) for f, c in zip(self.nonlinearities, self.input_of)]
         return np.column_stack(columns) if columns else np.zeros((len(u), 0))
@@ -196,7 +196,7 @@ class StateSpace(Model):
             StructureError: u0 of the wrong size, a pole at 1, or no equilibrium found.
         """
         u = self._operating_point(u0)[None]
-        x, y = equilibria(self, self.expanded(u), u, None if near is None else np.reshape(near, (1, self.nx)))
+        x, y = equilibria(self, self.expand_inputs(u), u, None if near is None else np.reshape(near, (1, self.nx)))
         return x[0], y[0]
 
     def static_curve(self, c: int, points: Array) -> Array:
@@ -226,7 +226,7 @@ class StateSpace(Model):
             slopes[:, j, c] = f.slope(u[:, c])
         z = self.latent_signals(x, u)
         inner = np.array([h.slope(one) for h, one in zip(self.latent, z.T)]).T.reshape(z.shape)[:, None]
-        Ez, Fz, back = self.Ez * inner, self.Fz * inner, self.returned(y)
+        Ez, Fz, back = self.Ez * inner, self.Fz * inner, self.output_feedback(y)
         C, D = self.C + Fz @ self.Cz, self.D @ slopes + Fz @ self.Dz
         return self.A + Ez @ self.Cz + back @ C, self.B @ slopes + Ez @ self.Dz + back @ D, C, D
 
@@ -238,7 +238,7 @@ class StateSpace(Model):
         """Return h(z) (N, k) at arguments z (N, k)."""
         return np.column_stack([h(z[:, j]) for j, h in enumerate(self.latent)]) if self.latent else z
 
-    def returned(self, y: Array) -> Array:
+    def output_feedback(self, y: Array) -> Array:
         """Return the derivative (N, n, l) of the next state with respect to the outputs y (N, l) fed back."""
         total = np.tile(self.L, (len(y), 1, 1))
         for j, (g, o) in enumerate(zip(self.feedback, self.output_of)):
@@ -247,7 +247,7 @@ class StateSpace(Model):
 
     # -- forms that predict the same -----------------------------------------------------------------------------
 
-    def transformed(self, T: ArrayLike) -> Self:
+    def transform(self, T: ArrayLike) -> Self:
         """Return the model in the states T x; predictions do not change. T (n, n) must be invertible."""
         turn, n = np.atleast_2d(np.asarray(T, dtype=float)), self.nx
         turn = turn.reshape(0, 0) if n == 0 and turn.size == 0 else turn
@@ -256,20 +256,20 @@ class StateSpace(Model):
         if n and np.linalg.cond(turn) > 1e14:
             raise StructureError("T is singular; a change of states must be invertible.")
         back = np.linalg.inv(turn)
-        noise = None if self.noise is None else self.noise.mapped(turn, np.eye(self.l))
+        noise = None if self.noise is None else self.noise.transform(turn, np.eye(self.l))
         moved = {name: turn @ getattr(self, name) for name in ("B", "E", "L", "K", "Ez", "offset_x")}
         return replace(self, A=turn @ self.A @ back, C=self.C @ back, Cz=self.Cz @ back, noise=noise, gauge="none",
                        **moved)
 
-    def balanced(self) -> Self:
+    def balance(self) -> Self:
         """Return the model in balanced states: both Gramians of (A, [B E Ez], [C; Cz]) are diagonal and equal.
 
         An unstable model, or one that is not minimal, is refused (`StructureError`).
         """
-        return self if self.nx == 0 else self.transformed(
+        return self if self.nx == 0 else self.transform(
             balancing(self.A, np.hstack([self.B, self.E, self.Ez]), np.vstack([self.C, self.Cz])))
 
-    def injected(self, gain: ArrayLike) -> Self:
+    def inject_output(self, gain: ArrayLike) -> Self:
         """Move gain times the output out of A into L: A - gain C, L + gain, K - gain.
 
         P1 and P3 do not change; P2 does, since it feeds back the measured output. With a gain (n, l) of -L the
@@ -299,8 +299,8 @@ class StateSpace(Model):
             back = back * self._signs(self.E, np.zeros((self.l, back.size))) if signs else back
         scales, back = np.where(scales == 0, 1.0, scales), np.where(back == 0, 1.0, back)
         return replace(self, B=self.B / scales, D=self.D / scales, E=self.E / back, gauge=gauge,
-                       nonlinearities=tuple(f.scaled(s) for f, s in zip(self.nonlinearities, scales)),
-                       feedback=tuple(g.scaled(s) for g, s in zip(self.feedback, back)))
+                       nonlinearities=tuple(f.times(s) for f, s in zip(self.nonlinearities, scales)),
+                       feedback=tuple(g.times(s) for g, s in zip(self.feedback, back)))
 
     @property
     def gain_signs(self) -> Array:
@@ -315,11 +315,11 @@ class StateSpace(Model):
         response = impulse_response(self.A, B, self.C, D, self.nx + 1)
         return plant_signs(matrix, B + self.L @ D, response, self.C, D)
 
-    def turned(self, signs: ArrayLike) -> Self:
+    def with_signs(self, signs: ArrayLike) -> Self:
         """Multiply every function of the inputs, and its columns of B and D, by its sign (r,), 1 or -1."""
         factors = np.asarray(signs, dtype=float)
         return replace(self, B=self.B * factors, D=self.D * factors,
-                       nonlinearities=tuple(f.scaled(sign) for f, sign in zip(self.nonlinearities, factors)))
+                       nonlinearities=tuple(f.times(sign) for f, sign in zip(self.nonlinearities, factors)))
 
     def _gains(self) -> Array:
         """Static gains (r,) of the linear part from every f to the output."""
@@ -337,9 +337,9 @@ class StateSpace(Model):
     def _in_raw_units(self, transform: Transform) -> Self:
         gain, shift = np.array(transform.y_scale), np.array(transform.y_offset)
         functions = [
-            f.mapped(transform.u_scale[c], transform.u_offset[c]) for f, c in zip(self.nonlinearities, self.input_of)]
+            f.in_units(transform.u_scale[c], transform.u_offset[c]) for f, c in zip(self.nonlinearities, self.input_of)]
         feedback = [
-            g.mapped(transform.y_scale[o], transform.y_offset[o]) for g, o in zip(self.feedback, self.output_of)]
+            g.in_units(transform.y_scale[o], transform.y_offset[o]) for g, o in zip(self.feedback, self.output_of)]
         constants, fed = (np.array([constant for _, constant in moved]) for moved in (functions, feedback))
         # the states take the unit that all outputs share: C, and with it what a norm of B means, stays as it is then
         state = gain[0] if np.all(gain == gain[0]) else 1.0
@@ -353,7 +353,7 @@ class StateSpace(Model):
             offset_y=offset_y,
             levels=None if self.levels is None else offset_y + gain * (self.levels - self.offset_y),
             nonlinearities=tuple(f for f, _ in functions), feedback=tuple(g for g, _ in feedback),
-            noise=None if self.noise is None else self.noise.mapped(state * np.eye(self.nx), np.diag(gain)),
+            noise=None if self.noise is None else self.noise.transform(state * np.eye(self.nx), np.diag(gain)),
             Ez=state * self.Ez, Fz=gain[:, None] * self.Fz, Cz=self.Cz / state, Dz=inward,
             offset_z=self.offset_z - inward @ np.array(transform.u_offset))
 

@@ -54,7 +54,7 @@ class Limit:
         shared = isinstance(member, EQUALITIES | INEQUALITIES) and any(side.size == 1 for side in sides)
         return cls(member, bound="" if shared else None)
 
-    def posed(self, sizes: np.ndarray) -> Constraint:
+    def impose(self, sizes: np.ndarray) -> Constraint:
         """Return the constraint with its rows divided by sizes; a cone as it is."""
         rows = rows_of(self.member)
         if rows is None or np.all(sizes == 1.0):
@@ -71,7 +71,7 @@ class Limit:
         return np.broadcast_to(shift, (self.member.size,))
 
 
-def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
+def name_limits(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
     """Bring what a builder returned, CVXPY constraints or `Limit` objects, into the form {name: (limit, ...)}.
 
     It returns one of them, a list, or a dictionary of either; the default is the name where it gave none.

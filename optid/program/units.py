@@ -62,7 +62,7 @@ def in_units(data: Any, units: Transform) -> Any:
         return data.in_units(units)
     changed = Transform.identity(data.m, data.l)
     same_inputs = (units.u_scale, units.u_offset) == (changed.u_scale, changed.u_offset)
-    return data.mapped((lambda u: u) if same_inputs else units.apply_u, units.apply_y, transform=changed)
+    return data.map_signals((lambda u: u) if same_inputs else units.apply_u, units.apply_y, transform=changed)
 
 
 def inner_bases(bases: Sequence[Any], units: Transform) -> tuple[Any, ...]:
@@ -72,7 +72,7 @@ def inner_bases(bases: Sequence[Any], units: Transform) -> tuple[Any, ...]:
 
 def outer_bases(bases: Sequence[Any], units: Transform) -> tuple[Any, ...]:
     """Return the bases of inputs in the units of the record."""
-    return tuple(basis.mapped(scale, origin)[0] for basis, scale, origin in zip(bases, units.u_scale, units.u_offset))
+    return tuple(basis.in_units(scale, origin)[0] for basis, scale, origin in zip(bases, units.u_scale, units.u_offset))
 
 
 def inverse(units: Transform) -> Transform:

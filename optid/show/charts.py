@@ -13,7 +13,7 @@ from optid.identify.dynamics import Levels, mean_slopes
 from optid.identify.uncertainty import Interval
 from optid.identify.validation import validate
 from optid.identify.validation.correlations import Correlation
-from optid.identify.validation.predictions import one_step_or_nan, simulated
+from optid.identify.validation.predictions import one_step_or_nan, simulate_outputs
 from optid.models.functions import StaticFunction, response_pairs, runs_free, static_functions
 from optid.phrases import p_equals
 from optid.show import summary
@@ -52,14 +52,14 @@ def response_axis(model: Any) -> Axis:
     return Axis(time_title(model.time_unit, model.dt == 1))
 
 
-def validated(model: Any, record: Data) -> "Validation":
+def validate_quietly(model: Any, record: Data) -> "Validation":
     """Validate a model without the warnings, which the notes repeat."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         return validate(model, record)
 
 
-def visited(function: StaticFunction, record: Data | None) -> Array:
+def argument_samples(function: StaticFunction, record: Data | None) -> Array:
     """Samples of the argument of a function; none if the simulation of a latent signal diverges."""
     try:
         return np.zeros(0) if record is None else function.samples(record)
@@ -74,7 +74,7 @@ def free_run(model: Any, record: Data) -> list[Array] | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         try:
-            return simulated(model, record)
+            return simulate_outputs(model, record)
         except DataError:
             return None
 
@@ -156,7 +156,7 @@ def nonlinearity_charts(fit: "Fit", linear: bool = False, families: Sequence[str
         if function.family not in families or function.is_linear and not linear:
             continue
         f = function.nonlinearity
-        samples = visited(function, record)
+        samples = argument_samples(function, record)
         samples = samples[np.isfinite(samples)]
         ends = f.basis.interval or ((samples.min(), samples.max()) if samples.size else (-1.0, 1.0))
         low, high = map(float, ends)

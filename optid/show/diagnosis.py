@@ -36,7 +36,7 @@ def diagnosis_document(found: Diagnosis, *, record: str = "", command: str = "")
     drawn = diagnosis_charts(found)
     notes = [*[found.status] * bool(found.status), *(f"{a}: {why}" for a, why in found.untestable.items())]
     banner = Banner(TONES.get(found.verdict, "fair"), words.headline(found),
-                    " ".join(words.explained(found, notes=False)), tuple(_cards(found)))
+                    " ".join(words.diagnosis_sentences(found, notes=False)), tuple(_cards(found)))
     lead = " · ".join(part for part in (record, found.model, words.window_words(found)) if part)
     return Document(f"Diagnosis: {found.verdict}", lead, [
         *record_findings(found.findings),

@@ -64,7 +64,7 @@ def magnitude_names(fault: Estimate) -> list[str]:
     return kind_of(fault.kind).size_names(fault.name, len(fault.size))
 
 
-def printed(found: Diagnosis) -> str:
+def diagnosis_text(found: Diagnosis) -> str:
     """Print a diagnosis in 80 columns."""
     lines = [
         *listed_findings(found.findings),
@@ -154,10 +154,10 @@ def course_words(found: Diagnosis) -> str:
 
 def explanation(found: Diagnosis) -> str:
     """State in three sentences the result, its probability and its evidence."""
-    return " ".join(explained(found))
+    return " ".join(diagnosis_sentences(found))
 
 
-def explained(found: Diagnosis, *, notes: bool = True) -> list[str]:
+def diagnosis_sentences(found: Diagnosis, *, notes: bool = True) -> list[str]:
     """State in sentences the result, its probability and its evidence; notes add what was not judged."""
     name = found.model if found.model.startswith("Hammerstein") else found.model[:1].lower() + found.model[1:]
     departs = f"The record departs from the healthy {name} (p-value {probability_words(found.p_value)}), but "

@@ -34,7 +34,7 @@ from optid.show.sections import (
     Section,
     attempt,
 )
-from optid.show.terminal import findings_lines, set_table, wrapped
+from optid.show.terminal import findings_lines, set_table, wrap_sentence
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -125,7 +125,7 @@ def record_document(data: Data, *, command: str = "") -> Document:
     """Return the document of a record: what reading it found, its channels, and their course."""
     raw = data.raw()
 
-    def drawn() -> list[Any]:
+    def draw() -> list[Any]:
         return [Charts([chart for k in range(min(raw.n_experiments, charts.MOST_EXPERIMENTS))
                         for chart in charts.time_charts(raw, k, [], f"time{k}")], wide=True)]
 
@@ -135,7 +135,7 @@ def record_document(data: Data, *, command: str = "") -> Document:
         *record_findings((*data.findings, *informativity(data).findings)),
         Section("channels", "Channels", lambda: [summary.channel_table(data)]),
         Section("tests", "What the record tells", lambda: [informativity_table(informativity(data))]),
-        Section("figures", "Figures", drawn, page_only=True),
+        Section("figures", "Figures", draw, page_only=True),
         *([Section("reproduce", "Reproduce", [Code(command)], page_only=True)] if command else []),
     ])
 
@@ -213,7 +213,7 @@ def _validations(fit: "Fit", test: Data | None) -> list[Any]:
 
 def _validation(model: Any, record: Data) -> list[Any]:
     try:
-        return validation_parts(charts.validated(model, record))
+        return validation_parts(charts.validate_quietly(model, record))
     except DataError as error:
         return [Notes([f"No validation: {error}"])]
 
@@ -356,5 +356,5 @@ def order_text(study: "OrderStudy") -> str:
              *(line for one in tables for line in set_table(one))]
     lines.append(f"Recommended: nx = {study.nx}{'' if scan is None else '; ' + str(scan.best('bic'))}")
     for reason in (*study.reasons, *(f"note: {note}" for note in study.notes)):
-        lines += wrapped(f"- {reason}")
+        lines += wrap_sentence(f"- {reason}")
     return "\n".join(lines)

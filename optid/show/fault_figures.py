@@ -12,18 +12,18 @@ from optid.faults.repair.reformulation import Reformulation
 from optid.show.diagnosis import diagnosis_charts
 from optid.show.diagnosis_words import headline
 from optid.show.isolability import isolation_chart
-from optid.show.panels import draw_chart, plain, shorten, styled
+from optid.show.panels import draw_chart, plain, shorten, with_style
 from optid.show.reformulation import explanation_names, reformulation_charts
 from optid.show.sections import Chart
 
 
-@styled
+@with_style
 def diagnosis(found: Diagnosis) -> Figure:
     """Draw innovations and energies below each other; `StructureError` for a diagnosis read from a file."""
     return _drawn(diagnosis_charts(found), 1, (9.6, 2.1), f"{found.verdict}: {headline(found)}")
 
 
-@styled
+@with_style
 def reformulation(found: Reformulation) -> Figure:
     """Draw actuators and attainable outputs, before the fault and now, side by side."""
     title = f"{found.status}: {explanation_names(found.members) or 'healthy'}"
@@ -44,7 +44,7 @@ def _drawn(charts: Sequence[Chart], most: int, size: tuple[float, float], title:
     return figure
 
 
-@styled
+@with_style
 def isolability(found: Isolability) -> Figure:
     """Draw the deflections that isolate each fault from each other, and the probabilities by deflection."""
     needed = found.matrix * found.unit[:, None]

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from optid.data.record import Data
 from optid.identify.order.study import OrderStudy
 from optid.show import charts, panels
-from optid.show.panels import CLOSEUP, plain, styled
+from optid.show.panels import CLOSEUP, plain, with_style
 
 if TYPE_CHECKING:
     from optid.identify.validation import Comparison
@@ -23,7 +23,7 @@ def channels(data: Data) -> Figure:
     for c, (panel, (name, unit)) in enumerate(zip(axes, units.items())):
         for e, samples in zip(data.experiments, data.records):
             t = panels.instants(e.start + data.dt * np.arange(e.n_samples), x)
-            panel.plot(*panels.thinned(t, samples[:, c]), lw=0.9, drawstyle="steps-post" if c < data.m else "default")
+            panel.plot(*panels.thin_line(t, samples[:, c]), lw=0.9, drawstyle="steps-post" if c < data.m else "default")
         panel.set_ylabel(plain(f"{name} [{unit}]" if unit else name))
     axes[-1].set_xlabel(x.title)
     if x.dates:
@@ -33,7 +33,7 @@ def channels(data: Data) -> Figure:
     return figure
 
 
-@styled
+@with_style
 def simulations(found: "Comparison") -> Figure:
     """Draw the measured outputs and every simulation; of a long record the stretch in which the outputs move most."""
     record, several = found.data, sum(bool(arrays) for arrays in found.simulated)
@@ -50,7 +50,7 @@ def simulations(found: "Comparison") -> Figure:
     return figure
 
 
-@styled
+@with_style
 def order_study(study: OrderStudy) -> Figure:
     """Draw singular values with thresholds, criteria and hold-out by number of states, and the scan of lags."""
     shown = charts.order_charts(study)

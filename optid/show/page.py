@@ -45,14 +45,14 @@ def render(document: Document) -> str:
     shown: list[dict[str, Any]] = []
 
     def place(chart: Chart) -> int:
-        shown.append(coded(chart))
+        shown.append(encode_chart(chart))
         return len(shown) - 1
 
     sections = [(s, s.content()) for s in document.sections]
     names = {"trust": "Verdict", "optimum": "Solution"}
     return template("document.html.j2").render(
         version=__version__, title=document.title, lead=document.lead, parts=sections, place=place,
-        breakable=_breakable, charts=lambda: embedded(shown), **scripts(*SCRIPTS),
+        breakable=_breakable, charts=lambda: embed_json(shown), **scripts(*SCRIPTS),
         sections=[(s.id, s.title or names.get(s.id, s.id)) for s, _ in sections])
 
 
@@ -61,7 +61,7 @@ def _breakable(equation: str) -> str:
     return re.sub(r" (?![+-] )", "\N{NO-BREAK SPACE}", equation)
 
 
-def coded(chart: Chart, most: int = MOST) -> dict[str, Any]:
+def encode_chart(chart: Chart, most: int = MOST) -> dict[str, Any]:
     """Return a chart as JSON types for the script of the page, its curves of at most so many samples."""
     axes = {name: {key: value for key, value in asdict(axis).items()
                    if value is not None and value is not False and value != ""
@@ -107,7 +107,7 @@ def scripts(*names: str) -> dict[str, Any]:
     return {"script": Markup(text), "digest": base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}
 
 
-def embedded(payload: Any) -> Markup:
+def embed_json(payload: Any) -> Markup:
     """Return a value as JSON that can stand inside a script element: no text in it can end the element."""
     text = json.dumps(payload, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

@@ -77,7 +77,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def styled(draw: Callable[P, R]) -> Callable[P, R]:
+def with_style(draw: Callable[P, R]) -> Callable[P, R]:
     """Draw in this style; the user's settings stay as they are."""
 
     @wraps(draw)
@@ -117,7 +117,7 @@ def shorten(name: str, most: int = 18) -> str:
     return name if len(name) <= most else name[: most - 1] + "\N{HORIZONTAL ELLIPSIS}"
 
 
-def thinned(t: Array, y: Array) -> tuple[Array, Array]:
+def thin_line(t: Array, y: Array) -> tuple[Array, Array]:
     """Keep the extremes of every bin of a long line, so that no peak is lost; t, y (N,) become `POINTS` long."""
     if y.size <= POINTS:
         return t, y
@@ -176,7 +176,7 @@ def draw_chart(ax: Axes, chart: Chart, legend: bool = True, title: str = "") -> 
                     label=name, fillstyle="none" if one.kind == "zeros" else "full")
         else:
             style: Any = (0, tuple(map(float, one.dash.split()))) if one.dash else dash
-            ax.plot(*thinned(xs, ys), color=colour, linestyle=style, linewidth=0.85 * one.width, label=name)
+            ax.plot(*thin_line(xs, ys), color=colour, linestyle=style, linewidth=0.85 * one.width, label=name)
     ax.set(xlabel=plain(chart.x.title), ylabel=plain(chart.y.title), title=plain(title or chart.title))
     ax.set(**{f"{name}scale": "log" for name, axis in (("x", chart.x), ("y", chart.y)) if axis.log})
     ax.set(xlim=(chart.x.low, chart.x.high), ylim=(chart.y.low, chart.y.high))

@@ -18,7 +18,7 @@ from optid.lazy import public_names
 from optid.models.functions import static_functions
 from optid.show import charts, frequency, panels, responses
 from optid.show.estimates import uncertainty
-from optid.show.panels import CLOSEUP, MUTED, attempt_panels, liveliest, plain, shorten, styled
+from optid.show.panels import CLOSEUP, MUTED, attempt_panels, liveliest, plain, shorten, with_style
 from optid.show.sections import Chart
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ RUNGS = {"instant": "instant proof", "ascent": "dual ascent", "sdp": "SDP", "pro
 THRESHOLD = 1e-8
 """Relative gap that counts as a proof."""
 
-@styled
+@with_style
 def overview(fit: "Fit", test: Data | None = None) -> Figure:
     """Draw the result on one page: fit over time, characteristics, residual tests, poles, frequency response.
 
@@ -64,7 +64,7 @@ def overview(fit: "Fit", test: Data | None = None) -> Figure:
     return figure
 
 
-@styled
+@with_style
 def fit_over_time(fit: "Fit", data: Data | None = None) -> Figure:
     """Draw measured, simulated and one-step predicted outputs; long records with a close-up.
 
@@ -82,7 +82,7 @@ def fit_over_time(fit: "Fit", data: Data | None = None) -> Figure:
     return figure
 
 
-@styled
+@with_style
 def nonlinearity(fit: "Fit") -> Figure:
     """Draw every static nonlinearity in the gauge of the model, with its 95 % band and where samples lie.
 
@@ -97,7 +97,7 @@ def nonlinearity(fit: "Fit") -> Figure:
     return figure
 
 
-@styled
+@with_style
 def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | None = None) -> Figure:
     """Draw autocorrelations of the residuals and their cross-correlations with the inputs, with 99 % bands.
 
@@ -115,7 +115,7 @@ def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | N
     return figure
 
 
-@styled
+@with_style
 def poles_and_response(fit: "Fit") -> Figure:
     """Draw poles, and frequency response and step responses from input to output, with 95 % bands."""
     figure = Figure(figsize=(10.0, 3.3 * -(-(2 + fit.model.m * fit.model.l) // 3)), layout="constrained")
@@ -124,7 +124,7 @@ def poles_and_response(fit: "Fit") -> Figure:
     return figure
 
 
-@styled
+@with_style
 def bode(result: Any, hertz: bool = False) -> Figure:
     """Draw magnitude and phase from every input to every output, of a fit with 95 % bands.
 
@@ -140,13 +140,13 @@ def bode(result: Any, hertz: bool = False) -> Figure:
     return figure
 
 
-@styled
+@with_style
 def nyquist(result: Any) -> Figure:
     """Draw the frequency response of a fit or model in the complex plane, of a fit with 95 % ellipses."""
     return _plane(frequency.nyquist_chart(*_linear_part(result)))
 
 
-@styled
+@with_style
 def poles_and_zeros(result: Any) -> Figure:
     """Draw poles (crosses) and zeros (circles) of a fit or model, of a fit with 95 % ellipses, and bars of real ones.
 
@@ -174,7 +174,7 @@ def _linear_part(result: Any) -> tuple[Any, Any, Any]:
     return result.model, input_levels(result.model, record), uncertainty(result)[0]
 
 
-@styled
+@with_style
 def noise(fit: "Fit") -> Figure:
     """Draw the spectral density of the noise at every output, in dB of its squared unit.
 
@@ -186,7 +186,7 @@ def noise(fit: "Fit") -> Figure:
     return figure
 
 
-@styled
+@with_style
 def certificate(fit: "Fit") -> Figure:
     """Draw the steps of the proof of global optimality and the remaining gap."""
     bound = fit.solution.bound
@@ -206,7 +206,7 @@ def certificate(fit: "Fit") -> Figure:
     return figure
 
 
-@styled
+@with_style
 def singular_values(fit: "Fit") -> Figure:
     """Draw the singular values of Theta of every input, before the rank is forced to one.
 
@@ -223,7 +223,7 @@ def singular_values(fit: "Fit") -> Figure:
     return figure
 
 
-@styled
+@with_style
 def spectra(fit: "Fit") -> Figure:
     """Draw the singular values that a procedure of several steps measured, from which it read the order.
 
@@ -304,7 +304,7 @@ def _panels(figure: Any, shown: Sequence[Chart]) -> None:
 def _validated(model: Any, record: Data) -> Validation | str:
     """Return the validation, or the reason why there is none."""
     try:
-        return charts.validated(model, record)
+        return charts.validate_quietly(model, record)
     except DataError as error:
         return f"No residual tests: {error}"
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from optid.data.record import Data
 from optid.show import charts, checks, documents, estimates, responses, summary
 from optid.show.sections import Notes, attempt
-from optid.show.terminal import WIDTH, facts_lines, findings_lines, part_lines, set_table, text, wrapped
+from optid.show.terminal import WIDTH, facts_lines, findings_lines, part_lines, set_table, text, wrap_sentence
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -30,7 +30,8 @@ def describe(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = Tr
         return text(replace(document, sections=shown))
     tone, word, sentence = summary.verdict(fit)
     rule = "=" * WIDTH
-    return "\n".join([*findings_lines(fit.record_findings), rule, f"No model: {word}", rule, *wrapped(sentence), "",
+    return "\n".join([*findings_lines(fit.record_findings), rule, f"No model: {word}", rule, *wrap_sentence(sentence),
+                      "",
                       *facts_lines(summary.certificate_facts(fit)), rule])
 
 
@@ -48,7 +49,7 @@ def describe_interval(fit: "Fit", record: Data) -> str:
     lines = []
     for part in attempt("The interval of the simulation", lambda: [charts.interval_band(fit, record)]):
         said = part.sentences if isinstance(part, Notes) else [part[1], *(f"Note: {note}" for note in part[2])]
-        lines += [line for one in said if one for line in wrapped(one)]
+        lines += [line for one in said if one for line in wrap_sentence(one)]
     return "\n".join(lines)
 
 
@@ -57,7 +58,7 @@ def describe_checks(checked: "Validation") -> str:
     lines = [*findings_lines(checked.findings), f"Validation on {checked.data}" if checked.data else "Validation"]
     for part in attempt("Errors and tests", lambda: checks.validation_tables(checked)):
         lines += [*part_lines(part), ""]
-    return "\n".join([*lines[:-1], *(line for note in checked.notes for line in wrapped(f"Note: {note}"))])
+    return "\n".join([*lines[:-1], *(line for note in checked.notes for line in wrap_sentence(f"Note: {note}"))])
 
 
 def describe_horizons(curve: "HorizonCurve") -> str:
@@ -86,9 +87,9 @@ def describe_search(found: "Identification") -> str:
 def search_lines(found: "Identification") -> list[str]:
     """Return the table of the best structures by class, and the reasons of the choice, line by line."""
     lines = set_table(checks.search_table(found))
-    lines += [line for reason in found.reasons for line in wrapped(f"- {reason}")]
+    lines += [line for reason in found.reasons for line in wrap_sentence(f"- {reason}")]
     chosen = found.chosen.candidate
-    lines += ["", *wrapped(f"Chosen: --formulation {chosen.formulation} {chosen.words}", "    ")]
+    lines += ["", *wrap_sentence(f"Chosen: --formulation {chosen.formulation} {chosen.words}", "    ")]
     if found.stopped:
-        lines += wrapped(f"Note: {found.ended}")
+        lines += wrap_sentence(f"Note: {found.ended}")
     return lines

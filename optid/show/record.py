@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optid.phrases import p_equals
-from optid.show.terminal import set_table, wrapped
+from optid.show.terminal import set_table, wrap_sentence
 from optid.show.wording import Table, number
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def informativity_table(told: "Informativity") -> Table:
 
 def describe_informativity(told: "Informativity") -> str:
     """Return what a record can tell as text, at most 80 columns wide."""
-    lines = [line for sentence in told.findings for line in wrapped(f"- {sentence}")]
+    lines = [line for sentence in told.findings for line in wrap_sentence(f"- {sentence}")]
     if told.untested:
         lines.append(f"Feedback, effects and dead times were not tested: {told.untested}.")
     if told.processes:

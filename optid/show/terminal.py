@@ -27,7 +27,7 @@ def text(document: Document) -> str:
 def part_lines(part: object) -> list[str]:
     """Return the lines of a part; none for charts and folds."""
     if isinstance(part, Banner):
-        return [*wrapped(part.word), *(wrapped(part.sentence) if part.sentence else [])]
+        return [*wrap_sentence(part.word), *(wrap_sentence(part.sentence) if part.sentence else [])]
     if isinstance(part, FactColumns):
         return _columns(part.left, part.right)
     if isinstance(part, list):
@@ -38,7 +38,7 @@ def part_lines(part: object) -> list[str]:
         blocks = [part_lines(table) for table in part.tables]
         return [line for k, block in enumerate(blocks) for line in ([_rule("-")] * bool(k) + block)]
     if isinstance(part, Notes):
-        return [line for sentence in part.sentences for line in wrapped(f"Note: {sentence}")]
+        return [line for sentence in part.sentences for line in wrap_sentence(f"Note: {sentence}")]
     if isinstance(part, Findings):
         return findings_lines(part.sentences)
     if isinstance(part, Code):
@@ -50,7 +50,7 @@ def _rule(sign: str) -> str:
     return sign * WIDTH
 
 
-def wrapped(text: str, indent: str = "  ") -> list[str]:
+def wrap_sentence(text: str, indent: str = "  ") -> list[str]:
     """Break a sentence into lines of the page, those after the first indented."""
     return wrap(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False) or [""]
 
@@ -73,14 +73,14 @@ def _equation(text: str) -> list[str]:
 
 def findings_lines(findings: Sequence[str]) -> list[str]:
     """Set the findings of a record under their heading; none without findings."""
-    return [line for sentence in listed_findings(findings) for line in wrapped(sentence)]
+    return [line for sentence in listed_findings(findings) for line in wrap_sentence(sentence)]
 
 
 def facts_lines(facts: Facts) -> list[str]:
     """Set facts one below the other."""
     lines = []
     for name, value in facts:
-        lines += wrapped(f"{name}: {value}")
+        lines += wrap_sentence(f"{name}: {value}")
     return lines
 
 
@@ -102,11 +102,11 @@ def set_table(table: Table) -> list[str]:
     room = WIDTH - sum(widths) - len(widths)
     names = min(max(len(row[0]) for row in [table.head, *table.rows]), MOST_NAME, max(room, 0))
     gap = 2 if names + sum(widths) + 2 * len(widths) <= WIDTH else 1
-    lines = wrapped(table.title) if table.title else []
+    lines = wrap_sentence(table.title) if table.title else []
     for row in (*[table.head] * any(table.head), *table.rows):
         cells = "".join(" " * gap + f"{cell:>{width}}" for cell, width in zip(row[1:], widths))
         if len(row[0]) > names:
             lines += [row[0], " " * names + cells]
         else:
             lines.append(f"{row[0]:<{names}}{cells}".rstrip())
-    return lines + (wrapped(table.note) if table.note else [])
+    return lines + (wrap_sentence(table.note) if table.note else [])

@@ -101,7 +101,7 @@ def _judged(program: Program, answer: Answer, base: Solution) -> Solution:
          for name, start in problem.start.items()}
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
         found = judge(problem, x, duals)
-        values, structural = program.completed(x), {GAUGE: found.gauge} if problem.gauged else {}
+        values, structural = program.complete_values(x), {GAUGE: found.gauge} if problem.gauged else {}
         if "residual" in values:
             structural["residual"] = duals.get("residual", -2.0 * values["residual"])
         if "structure" in duals:  # of a low-rank matrix

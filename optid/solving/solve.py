@@ -129,7 +129,7 @@ class Evidence:
     # the step whose programme the objective is that of, "" for the last one
     main: str = ""
 
-    def extended(self) -> tuple[Any, dict[str, Any]]:
+    def run_extension(self) -> tuple[Any, dict[str, Any]]:
         """Return the completed model and further figures."""
         return self.extend() if self.extend else (self.model, {})
 
@@ -217,6 +217,6 @@ def run(problem: Program | Problem | Procedure, solver: Any = "auto", *, options
             solution = replace(solution, objective=found.objective, bound=bound, status=found.status,
                                reason=found.reason)
             if found.values is not None:
-                solution = replace(solution, values=program.completed(found.values))
+                solution = replace(solution, values=program.complete_values(found.values))
             figures = {**found.figures, **_substitutions(steps)}
             return Outcome(found.model, solution, program, tuple(steps), figures, constrained, found)

@@ -35,11 +35,11 @@ def response_of(autoregression: Array, length: int = LONGEST, *, fade: bool = Tr
     return np.array(found)
 
 
-def scattered(blocks: Iterable[tuple[Array, int]], response: Array, root: Array) -> Array:
+def score_covariance(blocks: Iterable[tuple[Array, int]], response: Array, root: Array) -> Array:
     """Return the covariance (q, q) of sum_k J(k)' e(k), e(k) = sum_i H_i w(k-i), of w with the covariance root' root.
 
     With the response H (M + 1, l, l) the sum is that of G(k)' w(k), G(k) = sum_i H_i' J(k+i): the rows [J | error]
-    (T l, q + 1) of blocks in order, as for `optid.statistics.linearised.linearised`, are filtered against time.
+    (T l, q + 1) of blocks in order, as for `optid.statistics.linearised.linearise_errors`, are filtered against time.
     """
     ahead, outputs = len(response) - 1, len(root)
     held: Array | None = None

@@ -83,7 +83,7 @@ class Linearised:
         return matrix, errors
 
 
-def linearised(blocks: Callable[[int], Iterable[tuple[Array, int]]], experiments: int, n: int, p: int,
+def linearise_errors(blocks: Callable[[int], Iterable[tuple[Array, int]]], experiments: int, n: int, p: int,
                gauge: Array | None = None, method: Method = "auto") -> Linearised:
     """Compress the errors of all experiments with their sensitivities by n initial states and p shared unknowns.
 
@@ -92,22 +92,23 @@ def linearised(blocks: Callable[[int], Iterable[tuple[Array, int]]], experiments
     which are given weight.
     """
     use: Literal["gram", "qr"] = "qr" if method == "qr" else "gram"
-    factors, rows = zip(*(compressed(blocks(i), n + p + 1, use, gauge, n) for i in range(experiments)))
-    states, rest = zip(*(eliminated(factor, n) for factor in factors))
+    factors, rows = zip(*(compress_blocks(blocks(i), n + p + 1, use, gauge, n) for i in range(experiments)))
+    states, rest = zip(*(eliminate_state(factor, n) for factor in factors))
     triangle = rest[0] if experiments == 1 else np.linalg.qr(np.vstack(rest), mode="r")
     full = np.zeros((p + 1, p + 1))
     full[: len(triangle)] = triangle
     condition = conditioning(full[:p, :p] * np.where(np.diag(full)[:p] < 0, -1.0, 1.0)[:, None]) if p else 1.0
     if method == "auto" and not condition < CONDITION_LIMIT:
-        return linearised(blocks, experiments, n, p, gauge, "qr")
+        return linearise_errors(blocks, experiments, n, p, gauge, "qr")
     return Linearised(full[:p, :p], full[:p, p], states, float(full[p, p] ** 2), sum(rows), condition, use)
 
 
-def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, gauge: Array | None = None,
+def compress_blocks(blocks: Iterable[tuple[Array, int]], columns: int, method: str, gauge: Array | None = None,
                first: int = 0) -> tuple[Array, int]:
     """Return a factor of the rows [x0 | shared | (measured) | errors] of an experiment, and the number of errors.
 
-    Columns of a state that is forgotten may be missing on the left. The gauge, as in `linearised`, takes part before
+    Columns of a state that is forgotten may be missing on the left. The gauge, as in `linearise_errors`,
+    takes part before
     the factorisation by "gram" or "qr", which so is regular; column ``first`` is that of the first shared unknown.
     """
     def add(block: Array) -> None:
@@ -128,6 +129,6 @@ def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, g
     return total if exact else any_root_of_gram(total), rows
 
 
-def eliminated(factor: Array, n: int) -> tuple[tuple[Array, Array, Array], Array]:
+def eliminate_state(factor: Array, n: int) -> tuple[tuple[Array, Array, Array], Array]:
     """Split an upper triangular factor of [x0 | shared | errors] into the part of x0 and the rest."""
     return (factor[:n, :n], factor[:n, n:-1], factor[:n, -1]), factor[n:, n:]

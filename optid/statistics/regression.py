@@ -14,7 +14,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.bases.basis import Basis
-from optid.data.reduction import available_cores, mapped
+from optid.data.reduction import available_cores, map_parts
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.models.layout import Layout
 from optid.statistics.blocks import CHUNK, Frame, blocks_of, check_channels, cut, records, stretches, used_rows
@@ -161,7 +161,7 @@ def accumulate(data: "Data | Stream", layout: Layout, weights: Sequence[Array] |
     """
     threads = available_cores(threads)
     sums = _total(data, layout, weights, chunk, threads, partial(Sums, Frame.of(layout)))
-    gram = layout.contrasted(layout.contrasted(sums.complete()).T)
+    gram = layout.reduce_rows(layout.reduce_rows(sums.complete()).T)
     return Statistics(layout, (gram + gram.T) / 2, sums.rows, sums.candidates)
 
 
@@ -171,7 +171,7 @@ def factorise(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | 
 
     Arguments and errors as `collect`, without its checks of rank.
     """
-    total = _total(data, layout, weights, chunk, 1, partial(Factor, layout.n_columns + layout.l, layout.contrasted))
+    total = _total(data, layout, weights, chunk, 1, partial(Factor, layout.n_columns + layout.l, layout.reduce_rows))
     return Statistics(layout, total.root.T @ total.root, total.rows, total.candidates, total.root)
 
 
@@ -218,7 +218,7 @@ def _total(
 
     parts = (part for name, chunks in records(data, layout, weights) for part in cut(chunks, name, layout, chunk))
     total = start()
-    for sums in mapped(lambda stretch: start().add_all(blocks_of(stretch, layout, chunk)), parts, threads):
+    for sums in map_parts(lambda stretch: start().add_all(blocks_of(stretch, layout, chunk)), parts, threads):
         total.merge(sums)
     return total
 

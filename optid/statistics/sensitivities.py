@@ -27,7 +27,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.models import recursions
 from optid.models.recursions import DEAD, PRESENT, Filtered, all_pole, late_njit, lfilter
-from optid.statistics.linearised import Linearised, Method, compressed, eliminated, linearised
+from optid.statistics.linearised import Linearised, Method, compress_blocks, eliminate_state, linearise_errors
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 if TYPE_CHECKING:
@@ -51,9 +51,9 @@ class TransferPredictor:
         """Predict over all experiments and compress the errors (predicted less measured) with their sensitivities.
 
         C must be invertible, and A stable where D is not A; gauge and method are as in
-        `optid.statistics.linearised.linearised`.
+        `optid.statistics.linearised.linearise_errors`.
         """
-        return linearised(partial(self.blocks, point), self.unknowns.experiments, self.unknowns.memory,
+        return linearise_errors(partial(self.blocks, point), self.unknowns.experiments, self.unknowns.memory,
                           self.unknowns.shared, gauge, method)
 
     def instruments(self, point: TransferPoint) -> Array:
@@ -66,7 +66,7 @@ class TransferPredictor:
         n, size = self.unknowns.memory, self.unknowns.shared + self.unknowns.layout.na + 1
         total = np.zeros((size, size))
         for i in range(self.unknowns.experiments):
-            _, rest = eliminated(compressed(self.blocks(point, i, measured=True), n + size, "gram")[0], n)
+            _, rest = eliminate_state(compress_blocks(self.blocks(point, i, measured=True), n + size, "gram")[0], n)
             total += rest.T @ rest
         return total
 
@@ -121,9 +121,9 @@ class TransferPredictor:
             block[:depth] = history
             rows = block[depth:]
             for i in range(head):
-                rows[:, i] = run.shifted(run.impulse, i)
+                rows[:, i] = run.delay(run.impulse, i)
             if unknowns.levels:
-                rows[:, head] = run.shifted(run.step, 0)
+                rows[:, head] = run.delay(run.step, 0)
             shared = head + unknowns.levels
             if unknowns.apart:
                 lines = np.empty((len(past) + count, 1 + measured))
@@ -144,7 +144,7 @@ class TransferPredictor:
                 for j, lag in enumerate(lags):
                     rows[:, shared + at[f"b{c}"].start + j] = f[run.n - lag :][:count]
             if unknowns.constant:
-                rows[:, shared + at["offset"].start] = run.shifted(run.step, 0)
+                rows[:, shared + at["offset"].start] = run.delay(run.step, 0)
             for name, signal in (("c", innovations), ("d", -explained)):
                 for i in range(at[name].stop - at[name].start):
                     rows[:, shared + at[name].start + i] = signal[depth + start - i - 1 :][:count]
@@ -199,7 +199,7 @@ class _Run:
             self.peak = max(self.peak, float(np.max(np.abs(table[:, self.impulse]))))
         self.started, self.history, self.table = True, table[len(table) - past :], _through(self.d, table)
 
-    def shifted(self, columns: int | slice, lag: int) -> Array:
+    def delay(self, columns: int | slice, lag: int) -> Array:
         """Return filtered signals of the chunk, delayed."""
         return self.table[self.n - lag : self.n - lag + self.count, columns]
 
@@ -207,7 +207,7 @@ class _Run:
         """Return B_c eta_c, filtered, (T, P_c)."""
         total = np.zeros((self.count, self.spans[c].stop - self.spans[c].start))
         for b, lag in zip(self.point.bs[c], self.unknowns.layout.lags[c]):
-            total += b * self.shifted(self.spans[c], lag)
+            total += b * self.delay(self.spans[c], lag)
         return total
 
 

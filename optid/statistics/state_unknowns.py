@@ -242,18 +242,18 @@ class StateUnknowns(Unknowns):
         mu, nu, c = (np.concatenate([np.zeros(0), *of]) for of in (at.mus, at.nus, at.cs))
         d, b, e = at.d.size, at.b.size, at.e.size
 
-        def named(*names: str) -> Any:
+        def gains_of(*names: str) -> Any:
             return np.concatenate([signals[name] for name in names])
 
-        def repeated(gains: Any, of: Sequence[Array]) -> Any:
+        def repeat(gains: Any, of: Sequence[Array]) -> Any:
             return np.repeat(gains, [one.size for one in of], axis=1)
 
         rows = np.hstack([at.Cz, at.Dz, at.offset_z[:, None]])
         return Direct.of(
             [(latent, rows, signals["arguments"].reshape(rows.shape), 0),
-             (repeated(latent.T, at.cs), c, signals["phi"], 0)],
-            [(outputs, np.hstack([at.C, at.d, at.Fz, at.offset[:, None]]), named("x", "f", "w", "1"), 0),
-             (outputs, mu, signals["eta"], repeated(1 + np.arange(d).reshape(at.d.shape), at.mus))],
-            [(states, np.hstack([at.A, at.K, at.b, at.e, at.Ez]), named("x", "e", "f", "g", "w"), 0),
-             (states, mu, signals["eta"], repeated(1 + d + np.arange(b).reshape(at.b.shape), at.mus)),
-             (states, nu, signals["zeta"], repeated(1 + d + b + np.arange(e).reshape(at.e.shape), at.nus))])
+             (repeat(latent.T, at.cs), c, signals["phi"], 0)],
+            [(outputs, np.hstack([at.C, at.d, at.Fz, at.offset[:, None]]), gains_of("x", "f", "w", "1"), 0),
+             (outputs, mu, signals["eta"], repeat(1 + np.arange(d).reshape(at.d.shape), at.mus))],
+            [(states, np.hstack([at.A, at.K, at.b, at.e, at.Ez]), gains_of("x", "e", "f", "g", "w"), 0),
+             (states, mu, signals["eta"], repeat(1 + d + np.arange(b).reshape(at.b.shape), at.mus)),
+             (states, nu, signals["zeta"], repeat(1 + d + b + np.arange(e).reshape(at.e.shape), at.nus))])

@@ -242,7 +242,7 @@ def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chun
     (`RankError`).
     """
     check_lengths(stream.lengths, layout)
-    whole = _joined(start, [stream.reduced(partial(_run_of, layout, start, chunk), partial(_joined, start), threads)])
+    whole = _joined(start, [stream.reduce(partial(_run_of, layout, start, chunk), partial(_joined, start), threads)])
     last, before = -1, np.empty((0, layout.m + layout.l))
     for experiment, head, tail in whole.ends:
         before = before if experiment == last else before[:0]
@@ -258,14 +258,14 @@ def _run_of(layout: Layout, start: Callable[[], Total], chunk: int, part: "Part"
     reach, total = layout.first_row, start()
     head = tail = np.empty((0, layout.m + layout.l))
 
-    def watched() -> Iterable[Sequence[Array]]:
+    def watch() -> Iterable[Sequence[Array]]:
         nonlocal head, tail
         for u, y, _ in chunks:
             head = np.concatenate([head, np.hstack([u[:reach], y[:reach]])])[:reach]
             tail = _last(np.concatenate([tail, np.hstack([_last(u, reach), _last(y, reach)])]), reach)
             yield u, y
 
-    for stretch in cut(watched(), f"{part.label}, ", layout, chunk):
+    for stretch in cut(watch(), f"{part.label}, ", layout, chunk):
         total.add_all(blocks_of(stretch, layout, chunk))
     return SampleRun(total, ((part.experiment, head, tail),))
 

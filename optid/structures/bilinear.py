@@ -87,7 +87,7 @@ def descend(core: Core, bs: list[Array], iterations: int = 1000, alternations: i
         along, improved, promise = directions.T @ slope, False, np.inf
         while not improved and damping < 1e12:
             forces = along / (sizes + damping * float(np.mean(sizes)))
-            trial = _Projected.at(pieces, target, here.moved(-directions @ forces))
+            trial = _Projected.at(pieces, target, here.move(-directions @ forces))
             improved = trial.value <= here.value * (1 + 1e-14) + noise
             promise = min(promise, float(along @ forces))
             if not improved:
@@ -138,7 +138,7 @@ class _Projected:
         """Length of every mu_i."""
         return [float(np.linalg.norm(mu)) for mu in self.mus]
 
-    def moved(self, step: Array) -> list[Array]:
+    def move(self, step: Array) -> list[Array]:
         """Return the b_i after a step in units of the mu_i; those of a mu_i that vanishes stay."""
         parts = _split(step, [b.size for b in self.bs])
         return [b + part / size if size > 0 else b for b, part, size in zip(self.bs, parts, self.sizes)]

@@ -161,15 +161,15 @@ class NuclearProblem:
         found = self.hankel(v)
         return found if self.predictor is None else found - self.predictor.apply(theta)
 
-    def explained(self, z: Array) -> Array:
+    def predictor_coefficients(self, z: Array) -> Array:
         """Return (parameters, l): the coefficients that bring ``T(theta) Phi`` nearest to z."""
         if self.predictor is None:
             return np.zeros((0, self.l))
         return self.predictor.inverse @ self.predictor.adjoint(z, self.l)
 
-    def projected(self, z: Array) -> Array:
+    def remove_predictor(self, z: Array) -> Array:
         """Return z without what the predictor can explain."""
-        return z if self.predictor is None else z - self.predictor.apply(self.explained(z))
+        return z if self.predictor is None else z - self.predictor.apply(self.predictor_coefficients(z))
 
     @cached_property
     def gram(self) -> tuple[Array, bool]:
@@ -212,12 +212,12 @@ class NuclearProblem:
 
     def update(self, target: Array, weight: float, step: float) -> tuple[Array, Array]:
         """Return (v, theta) that minimise ``weight ‖v - y‖² + step/2 ‖matrix(v, theta) - target‖²``."""
-        pull = self.hankel_adjoint(self.projected(target)).ravel()
+        pull = self.hankel_adjoint(self.remove_predictor(target)).ravel()
         v = np.zeros(self.y.size)
         for group in self.groups:
             group.solve(v, self.data.ravel(), pull, weight, step)
         v = v.reshape(self.y.shape)
-        return v, self.explained(self.hankel(v) - target)
+        return v, self.predictor_coefficients(self.hankel(v) - target)
 
     def value(self, v: Array, theta: Array, weight: float) -> float:
         """Return the objective."""
@@ -230,12 +230,12 @@ class NuclearProblem:
         The multipliers (r, q) are projected so that the free variables are stationary, then scaled into the unit ball
         of the spectral norm: the point is always feasible. Multipliers of ``X = matrix(v, theta)`` give a tight bound.
         """
-        point = self.projected(multipliers)
+        point = self.remove_predictor(multipliers)
         for group in self.groups:
             if group.free.size:
                 step = np.zeros(self.y.size)
                 step[group.free] = group.free_inverse @ self.hankel_adjoint(point).ravel()[group.free]
-                point = point - self.projected(self.hankel(step.reshape(self.y.shape)))
+                point = point - self.remove_predictor(self.hankel(step.reshape(self.y.shape)))
         size = float(np.linalg.norm(point, 2))
         if size == 0.0:
             return 0.0, point

@@ -97,7 +97,7 @@ class Point:
             row, column = row + p * q, column + p + q
         return found
 
-    def normalised(self) -> "Point":
+    def normalise(self) -> "Point":
         """The same model in the gauge ||b_i|| = 1, first non-zero of b_i positive."""
         pairs = [_gauge(mu, b) for mu, b in zip(self.mus, self.bs)]
         return Point(self.w, tuple(mu for mu, _ in pairs), tuple(b for _, b in pairs))
@@ -181,7 +181,7 @@ class Core:
                 mu, b = (z[columns], np.ones(1)) if nb == 1 else (np.ones(1), z[columns])
             all_mus.append(mu)
             all_bs.append(b)
-        return Point(z[:self.problem.linear], tuple(all_mus), tuple(all_bs)).normalised()
+        return Point(z[:self.problem.linear], tuple(all_mus), tuple(all_bs)).normalise()
 
 
 def _solve_upper(triangle: Array, right: Array) -> Array:

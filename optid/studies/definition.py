@@ -26,7 +26,7 @@ from optid.backends.choice import back_ends
 from optid.data.readers import Format
 from optid.data.record import Data
 from optid.errors import DataError, StudyError, nearest
-from optid.registry import CONSTRAINTS, FORMULATIONS, named_constraint, registered
+from optid.registry import CONSTRAINTS, FORMULATIONS, find_entry_points, named_constraint
 from optid.solving.solve import solve
 from optid.studies.arguments import Problem, argument_problems, arguments, points
 from optid.studies.sources.systems import SYSTEMS, simulate
@@ -243,7 +243,7 @@ class FormulationEntry:
         problems += argument_problems(self.formulation, function, self.options, KEYS["formulation"])
         problems += _check_writable(self.options)
         for i, text in enumerate(self.constraints):
-            word, known = text.partition(":")[0], registered(CONSTRAINTS)
+            word, known = text.partition(":")[0], find_entry_points(CONSTRAINTS)
             try:
                 if word not in known:
                     raise ValueError(f"no constraint is called {word!r}. {nearest(word, known)}")
@@ -261,7 +261,7 @@ class FormulationEntry:
 
 def _formulation(name: Any) -> Callable[..., Any]:
     """Return a registered formulation; refuses others."""
-    known = registered(FORMULATIONS)
+    known = find_entry_points(FORMULATIONS)
     if not name or not isinstance(name, str):
         refuse([((), "needs formulation = \"NAME\" (optid formulations lists them)")])
     if name not in known:
@@ -472,7 +472,7 @@ def refuse_study(label: str, problems: Sequence[tuple[str, str]]) -> None:
         raise StudyError(f"{label} has {count}:" + "".join(f"\n  {line}" for line in lines))
 
 
-def written(keys: Sequence[str | int], words: int) -> str:
+def format_keys(keys: Sequence[str | int], words: int) -> str:
     """Write keys as in a study file: data[0].noise. The first so many solvers are words at its top."""
     first, *rest = keys or ("",)
     if first == "solvers" and rest and isinstance(rest[0], int):

@@ -15,7 +15,7 @@ import numpy as np
 
 from optid.backends.choice import AUTO, back_ends, find
 from optid.errors import SolverMissing, StudyError
-from optid.registry import FORMULATIONS, registered
+from optid.registry import FORMULATIONS, find_entry_points
 from optid.studies.definition import DataEntry, Definition, FormulationEntry, SolverEntry
 from optid.studies.sources.systems import system
 
@@ -68,7 +68,7 @@ def cells(study: Definition) -> list[Cell]:
     """
     if (count := number_of_cells(study)) > MOST:
         raise StudyError(f"study {study.name!r} has {count:,} cells; at most {MOST:,} are allowed: split it")
-    entries = [located(entry, study.folder) for entry in study.data]
+    entries = [with_absolute_paths(entry, study.folder) for entry in study.data]
     try:
         contents = [content_hash(entry) for entry in entries]
     except OSError as error:  # it was there when the data were checked
@@ -112,7 +112,7 @@ def check_unchanged(all_cells: Iterable[Cell], hashes: Mapping[tuple[str, str], 
                          "runs these cells again and sets the former rows aside; or give another database")
 
 
-def located(entry: DataEntry, folder: Path) -> DataEntry:
+def with_absolute_paths(entry: DataEntry, folder: Path) -> DataEntry:
     """Return an entry with absolute file names."""
     return replace(entry, files=tuple(str((folder / name).resolve()) for name in entry.files)) if entry.files else entry
 
@@ -195,8 +195,8 @@ def determining(formulation: str, solver: str, simulated: bool = False) -> dict[
     They are those of a registered formulation (its distribution and source), of a back end (for "auto" all that it
     chooses from) and, for a simulated record, the source of the systems.
     """
-    found = {name: installed(name) for name in ALWAYS}
-    point = registered(FORMULATIONS)[formulation]
+    found = {name: installed_version(name) for name in ALWAYS}
+    point = find_entry_points(FORMULATIONS)[formulation]
     if point.dist is not None:
         found[point.dist.name] = point.dist.version
     found[f"source of {formulation}"] = source_hash(point.value.partition(":")[0])
@@ -207,7 +207,7 @@ def determining(formulation: str, solver: str, simulated: bool = False) -> dict[
     return found
 
 
-def installed(distribution: str) -> str:
+def installed_version(distribution: str) -> str:
     """Return the version of a distribution, or "not installed"."""
     try:
         return version(distribution)
@@ -237,7 +237,7 @@ def _of_back_end(name: str) -> dict[str, str]:
         return {}
     module = getattr(inspect.getmodule(back_end.run), "__name__", "")
     distributions = {*back_end.pip.split(), *packages_of(module.partition(".")[0])}
-    found = {distribution: installed(distribution) for distribution in sorted(distributions)}
+    found = {distribution: installed_version(distribution) for distribution in sorted(distributions)}
     return found | {f"source of {name}": source_hash(module)}
 
 

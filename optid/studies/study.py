@@ -14,11 +14,11 @@ from optid.studies.definition import (
     TOP,
     Definition,
     as_toml,
+    format_keys,
     installed_solvers,
     problems_of,
     refuse_study,
     unknown_keys,
-    written,
 )
 from optid.studies.execution.running import run_to_frame
 from optid.studies.trial import check_data
@@ -57,7 +57,7 @@ class Study(Definition):
         try:
             super().__init__(name=name, data=data, formulations=formulations, solvers=solvers, **settings)
         except ValidationError as error:
-            refuse_study(f"study {name!r}", [(written(keys, 0), text) for keys, text in problems_of(error)])
+            refuse_study(f"study {name!r}", [(format_keys(keys, 0), text) for keys, text in problems_of(error)])
 
     @classmethod
     def from_toml(cls, path: str | Path) -> "Study":
@@ -94,7 +94,7 @@ class Study(Definition):
             raise StudyError(f"{label} has a problem:\n  lists or tables are nested too deeply") from None
         except ValueError as error:  # not TOML, or an integer with too many digits for Python
             raise StudyError(f"{label} has a problem:\n  {error}; {HINT}") from None
-        problems = [(written(keys, 0), text) for keys, text in unknown_keys(raw, TOP)]
+        problems = [(format_keys(keys, 0), text) for keys, text in unknown_keys(raw, TOP)]
         for key in KEYS:
             if not isinstance(raw.get(key, []), list):
                 how = f"[[{key}]], with two brackets" if isinstance(raw[key], dict) else f"tables, [[{key}]]"
@@ -109,7 +109,7 @@ class Study(Definition):
             Definition.__init__(study, **{"name": title, **settings}, data=raw.get("data", []), solvers=solvers,
                                 formulations=raw.get("formulation", []), folder=Path(folder))
         except ValidationError as error:
-            found = [(written(keys, len(words)), text) for keys, text in problems_of(error)]
+            found = [(format_keys(keys, len(words)), text) for keys, text in problems_of(error)]
             problems += [one for one in found if one[0] not in dict(problems)]
         refuse_study(label, problems)
         check_data(study, label)

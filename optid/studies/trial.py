@@ -17,7 +17,7 @@ from optid.registry import formulation as look_up
 from optid.registry import named_constraint
 from optid.solving.solve import solve
 from optid.studies.definition import DataEntry, Definition, FormulationEntry, refuse_study
-from optid.studies.grid import located
+from optid.studies.grid import with_absolute_paths
 from optid.studies.records import read_entry
 from optid.studies.sources.systems import simulate, system
 
@@ -55,7 +55,7 @@ class _Records:
         if entry.name not in self._read:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DataWarning)  # repeated when the record is used
-                self._read[entry.name] = read_entry(located(entry, self.folder))
+                self._read[entry.name] = read_entry(with_absolute_paths(entry, self.folder))
         return self._read[entry.name]
 
     def beginning(self, entry: DataEntry, samples: float = SHORT) -> Data:

@@ -61,7 +61,7 @@ class Bench:
     def _kept(self, request: Request) -> tuple[Any, Any]:
         from optid.show.charts import free_run
 
-        def begun(free: Request) -> Any:
+        def begin(free: Request) -> Any:
             found = self.moving[1] if request.draft and self.moving[0] == free.key else self._kept(free)[0]
             self.moving = free.key, found
             return found
@@ -69,7 +69,7 @@ class Bench:
         if request.key not in self.fits:
             if not request.draft:
                 self.moving = "", None
-            fit = request.fit(self.source.data, begun)
+            fit = request.fit(self.source.data, begin)
             self.moving = self.moving[0], fit
             self.fits[request.key] = fit, free_run(fit.model, fit.data.raw())
         self.fits.move_to_end(request.key)
@@ -88,7 +88,7 @@ class Bench:
         return views.time_chart(fit.data.raw(), run, int(asked.get("experiment", 0)), asked.get("view"))
 
     def _judge(self, asked: Mapping[str, Any]) -> dict[str, Any]:
-        return views.judged(self._found(asked)[0])
+        return views.verdict_view(self._found(asked)[0])
 
     def _export(self, asked: Mapping[str, Any]) -> dict[str, str]:
         from optid.show.report import render
@@ -105,7 +105,7 @@ class Bench:
         return {"name": "report.html", "text": render(fit, command="optid workbench")}
 
     def _diagnose(self, asked: Mapping[str, Any]) -> dict[str, Any]:
-        from optid.workbench.diagnosis import diagnosed
+        from optid.workbench.diagnosis import diagnose_window
 
         fit = None if self.source.model is not None else self._found(asked)[0]
-        return diagnosed(self.source.model if fit is None else fit, self.source.data, asked)
+        return diagnose_window(self.source.model if fit is None else fit, self.source.data, asked)

@@ -11,11 +11,11 @@ from optid.errors import StructureError
 from optid.show import diagnosis_words as words
 from optid.show.charts import time_axis
 from optid.show.diagnosis import TONES, diagnosis_charts
-from optid.show.page import coded
+from optid.show.page import encode_chart
 from optid.workbench.views import SHOWN
 
 
-def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, Any]:
+def diagnose_window(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, Any]:
     """Diagnose a window of a record.
 
     Args:
@@ -46,6 +46,6 @@ def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, An
                 "; ".join(words.onset_words(f).removeprefix("onset ") for f in answer.faults),
                 "; ".join(line for f in answer.faults for line in words.size_words(f))] for answer in found.candidates]
     return {"word": f"{found.verdict}: {words.headline(found)}", "tone": TONES.get(found.verdict, "fair"),
-            "sentences": [*words.explained(found, notes=False), *counted],
+            "sentences": [*words.diagnosis_sentences(found, notes=False), *counted],
             "labels": list(whole.labels), "answers": answers,
-            "charts": [coded(one, SHOWN) for one in diagnosis_charts(found, time_axis(whole_record), first)]}
+            "charts": [encode_chart(one, SHOWN) for one in diagnosis_charts(found, time_axis(whole_record), first)]}

@@ -27,7 +27,7 @@ class ChosenConstraint:
     def rule(self, **more: Any) -> Any:
         """Build it."""
         try:
-            return entry_point(CONSTRAINTS, self.word).load()(**self.arguments, **more).named(self.name)
+            return entry_point(CONSTRAINTS, self.word).load()(**self.arguments, **more).with_name(self.name)
         except TypeError as error:
             raise StructureError(f"constraint {self.word!r}: {error}") from None
 
@@ -107,7 +107,7 @@ def shortest(data: Data) -> int:
     return min(e.n_samples for e in data.experiments)
 
 
-def suggested(data: Data, suggestion: Mapping[str, Any]) -> dict[str, Any]:
+def suggest_state(data: Data, suggestion: Mapping[str, Any]) -> dict[str, Any]:
     """Return the initial state of a page: that of a built-in example, or small orders for any record.
 
     Args:

@@ -22,7 +22,7 @@ from urllib.parse import parse_qs, urlsplit
 from optid import __version__
 from optid.data.description import RECORD, first_findings
 from optid.errors import DataError, OptidError
-from optid.registry import FORMULATIONS, registered
+from optid.registry import FORMULATIONS, find_entry_points
 from optid.workbench.bench import Bench, BenchSource
 from optid.workbench.request import shortest
 
@@ -71,7 +71,7 @@ class Server(ThreadingHTTPServer):
         path.write_text(f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={self.address}">')
         return path
 
-    def opened(self) -> str:
+    def open_page(self) -> str:
         """Return the secret of a new page."""
         secret = secrets.token_urlsafe(24)
         with self.lock:
@@ -82,18 +82,18 @@ class Server(ThreadingHTTPServer):
 
     def page(self, secret: str) -> tuple[str, str]:
         """Return the page and its policy."""
-        from optid.show.page import embedded, scripts, template
+        from optid.show.page import embed_json, scripts, template
 
         data, script = self.source.data, scripts("plot.js", "parts.js", "workbench.js")
         begin = {
             "secret": secret, "start": self.source.start, "name": data.name or "record", "dt": data.dt,
             "samples": shortest(data), "origins": [e.start for e in data.experiments],
             "inputs": list(data.inputs), "outputs": list(data.outputs),
-            "formulations": [name for name in SHOWN if name in registered(FORMULATIONS)]}
+            "formulations": [name for name in SHOWN if name in find_entry_points(FORMULATIONS)]}
         lead = f"{data.n_samples} samples every {data.interval}"
         body = template("workbench.html.j2").render(
             version=__version__, title=data.name or "Record", lead=lead, sections=[], record=RECORD,
-            findings=first_findings(data.findings), begin=embedded(begin),
+            findings=first_findings(data.findings), begin=embed_json(begin),
             script=script["script"])
         return body, (f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{script['digest']}'; "
                       "img-src data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'")
@@ -109,7 +109,7 @@ class _Handler(BaseHTTPRequestHandler):
         token = parse_qs(asked.query).get("token", [""])[0].encode()
         if not (self._host() and asked.path == "/" and secrets.compare_digest(token, self.server.token.encode())):
             return self._send(403, "Open the address that optid workbench printed, with its token.", "text/plain")
-        body, policy = self.server.page(self.server.opened())
+        body, policy = self.server.page(self.server.open_page())
         self._send(200, body, "text/html", policy)
 
     def do_POST(self) -> None:

@@ -13,7 +13,7 @@ from optid.identify import responses
 from optid.identify.dynamics import input_levels
 from optid.identify.uncertainty import uncertainty
 from optid.show import charts, summary
-from optid.show.page import coded
+from optid.show.page import encode_chart
 from optid.show.responses import curve_charts, longest
 from optid.show.sections import TONES
 
@@ -39,7 +39,7 @@ def quick(fit: Any, run: list[Array] | None, output: str | None = None) -> dict[
         "tone": tone, "word": word, "sentence": sentence, "prices": prices, "findings": list(fit.findings),
         "objective": _finite(fit.solution.objective), "equation": model.equation(),
         "charts": [*characteristics(fit, record, output),
-                   coded(charts.pole_chart({"": model.poles})) | {"tool": "poles"}],
+                   encode_chart(charts.pole_chart({"": model.poles})) | {"tool": "poles"}],
     }
 
 
@@ -50,7 +50,7 @@ def time_chart(record: Data, run: list[Array] | None, experiment: int = 0,
     part = slice(None) if view is None else slice(max(int(view[0]), 0), int(view[1]))
     shown = charts.time_charts(record, experiment, [("simulated", run, {"width": 1.9})], "time", part=part,
                                heights=(250, 150))
-    return [coded(chart, SHOWN) | {"tool": "time"} for chart in shown]
+    return [encode_chart(chart, SHOWN) | {"tool": "time"} for chart in shown]
 
 
 def characteristics(fit: Any, record: Data, output: str | None = None) -> list[dict[str, Any]]:
@@ -64,18 +64,19 @@ def characteristics(fit: Any, record: Data, output: str | None = None) -> list[d
     found = []
     for one in curve_charts({"fit": [curve for curve in curves if curve.output == o]}, [model], record):
         curve, channel = one.curve, record.inputs[one.curve.input]
-        found.append(coded(one.chart) | {
+        found.append(encode_chart(one.chart) | {
             "tool": "" if curve.kind == "rate" else curve.kind, "channel": channel if model.m > 1 else None,
             "output": record.outputs[o] if several else None, "dt": model.dt, "interval": list(curve.levels)})
     return found
 
 
-def judged(fit: Any) -> dict[str, Any]:
+def verdict_view(fit: Any) -> dict[str, Any]:
     """Return the verdict on a fit and its residual tests."""
     found = fit.verdict
     return {"word": found.word, "tone": TONES[found.word], "sentence": summary.judgement(found),
             "parts": [list(row) for row in summary.verdict_table(found).rows],
-            "charts": [coded(one) for one in charts.correlation_charts(charts.validated(fit.model, fit.data.raw()))]}
+            "charts": [encode_chart(one) for one in charts.correlation_charts(charts.validate_quietly(fit.model,
+                                                                                                      fit.data.raw()))]}
 
 
 def _finite(value: float) -> float | None:

@@ -20,7 +20,7 @@ from optid.cli.terminal import spread
 from optid.core.program import programme_of
 from optid.descriptions import describe
 from optid.examples import EXAMPLES, example
-from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, registered
+from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, find_entry_points
 from optid.solving.solve import solve
 
 
@@ -52,8 +52,8 @@ ORDERS = ["--na", 1, "--nb", 2, "--basis", "polynomial:3"]
 
 @pytest.mark.parametrize("place", ["no_such_package:mine", "formulations.constraints.shape:no_such_function"])
 def test_a_broken_plug_in_takes_nothing_away(monkeypatch, place):
-    known = {**registered(CONSTRAINTS), "mine": EntryPoint("mine", place, CONSTRAINTS)}
-    monkeypatch.setattr("optid.cli.listings.registered", lambda group: known)
+    known = {**find_entry_points(CONSTRAINTS), "mine": EntryPoint("mine", place, CONSTRAINTS)}
+    monkeypatch.setattr("optid.cli.listings.find_entry_points", lambda group: known)
     result = run("constraints")
     assert result.exit_code == 0 and "cannot be loaded" in result.output and "monotone" in result.output
 
@@ -275,7 +275,7 @@ def last_programme(procedure):
 
 @pytest.mark.sampled(8)
 @pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
-@pytest.mark.parametrize("name", sorted(registered(FORMULATIONS)))
+@pytest.mark.parametrize("name", sorted(find_entry_points(FORMULATIONS)))
 def test_a_formulation_documents_the_variables_it_poses(name):
     rng = np.random.default_rng(0)
     u = rng.uniform(-1, 1, 60)
@@ -287,8 +287,8 @@ def test_a_formulation_documents_the_variables_it_poses(name):
                             {"a": 0.5, "b": 1.0}, time="discrete")
     basis = "linear" if name == "process.exact" else "polynomial:2"
     offered = {"equations": plant, "na": 1, "nb": 2, "nk": 0, "nc": 1, "nd": 1, "nx": 1, "basis": basis}
-    found = describe(registered(FORMULATIONS)[name])
-    function = registered(FORMULATIONS)[name].load()
+    found = describe(find_entry_points(FORMULATIONS)[name])
+    function = find_entry_points(FORMULATIONS)[name].load()
     parameters = inspect.signature(function).parameters
     assert list(found.signature.parameters) == list(parameters)
     problem = programme_of(function(data, **{key: value for key, value in offered.items() if key in parameters}))
@@ -314,7 +314,7 @@ def test_completion_in_a_shell():
 
 @pytest.mark.parametrize(("name", "group"), [("bj.exact", FORMULATIONS), ("fault.profile", FAULTS)])
 def test_one_formulation_is_explained(name, group):
-    found, shown = describe(registered(group)[name]), run("formulations", name)
+    found, shown = describe(find_entry_points(group)[name]), run("formulations", name)
     text = " ".join(shown.output.split())
     assert shown.exit_code == 0 and found.summary.split(".")[0][:40] in text
     assert all(f"--{key.replace('_', '-')} " in text for key in found.options if key != "constraints")

@@ -36,7 +36,7 @@ def fit_of(seed, *builders, gauge="norm"):
     """The fit of an output-error model, and a point somewhere near an optimum."""
     errors = transfer_errors(record(seed), 2, 2, 1, "polynomial:3", 0, 0, gauge, True)
     rng = np.random.default_rng(seed)
-    x = errors.normalised(np.concatenate([[-1.1, 0.3], rng.uniform(0.5, 1.5, errors.unknowns.size - 2)]))
+    x = errors.normalise(np.concatenate([[-1.1, 0.3], rng.uniform(0.5, 1.5, errors.unknowns.size - 2)]))
     problem = transfer_problem("a test", errors, x).subject_to(*builders)
     return TangentFit(problem, errors, partial(CompressedErrors, errors)), x
 

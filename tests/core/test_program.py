@@ -16,7 +16,7 @@ from optid.core.problem import Problem
 from optid.core.program import as_program
 from optid.core.terms import Squares
 from optid.errors import StructureError
-from optid.program.limits import named
+from optid.program.limits import name_limits
 from optid.program.solution import Status
 from optid.program.view import View
 from optid.solving.solve import solve
@@ -61,11 +61,11 @@ def test_what_is_neither_convex_nor_smooth_is_named():
 
 def test_constraints_of_every_form_get_names():
     x = cp.Variable(2, name="x")
-    group = named({"one": x <= 1, "two": [x >= 0, x[0] == 0.5]}, "default")
+    group = name_limits({"one": x <= 1, "two": [x >= 0, x[0] == 0.5]}, "default")
     assert [len(g) for g in group.values()] == [1, 2]
-    assert list(named(x <= 1, "default")) == ["default"]
-    assert list(named([x <= 1, x >= 0], "pair")) == ["pair[0]", "pair[1]"]
-    refuses(StructureError, "'truth'.*bool", named, {"truth": True}, "default")
+    assert list(name_limits(x <= 1, "default")) == ["default"]
+    assert list(name_limits([x <= 1, x >= 0], "pair")) == ["pair[0]", "pair[1]"]
+    refuses(StructureError, "'truth'.*bool", name_limits, {"truth": True}, "default")
 
 
 def test_constraint_in_a_callable_sees_the_named_variables():

@@ -5,7 +5,7 @@ import pytest
 
 import optid
 from optid.data.repeats import copies
-from optid.identify.blocks import Blocks, joined
+from optid.identify.blocks import Blocks, join_parts
 from optid.identify.informativity import informativity
 from optid.identify.search.determined import determined_bases
 
@@ -60,7 +60,7 @@ def test_equal_experiments_are_cut_at_the_same_samples(samples, count):
     blocks = Blocks.of(data, count)
     seen = [np.zeros(n, dtype=int) for n in (samples, samples, 180)]
     for b in range(count):
-        left, kept = joined(data, blocks.parts[b]), blocks.without(b)
+        left, kept = join_parts(data, blocks.parts[b]), blocks.without(b)
         assert {part[1] for part in blocks.parts[b]} == {blocks.parts[b][0].first}
         assert left.n_samples + kept.n_samples <= data.n_samples
         for part in blocks.parts[b]:

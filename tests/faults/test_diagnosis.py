@@ -429,7 +429,7 @@ def test_where_outputs_leave_the_identified_range_the_model_is_less_certain(foun
     expected = np.ones(y.shape)
     expected[21:24, 1] = 4.0  # an outlier and a missing reading are at no distance
     np.testing.assert_allclose(known.distance(y), expected)
-    assert [note.partition(" in ")[2] for note in known.extrapolated(y)] == [
+    assert [note.partition(" in ")[2] for note in known.output_range_notes(y)] == [
         "3 samples, first in sample 21: the model is less certain there."]
     monkeypatch.setattr(nuisance, "BEYOND", np.inf)  # the same likelihoods, at their full power
     full = diagnose(small(), faulty, found, model_uncertainty=known)

@@ -104,7 +104,7 @@ def test_the_effect_of_parameters_beside_a_lost_gain_is_that_of_the_filter_with_
 
     def innovations(moved):
         x, rows = white.states[0], []
-        drive = moved.expanded(u)
+        drive = moved.expand_inputs(u)
         for k in range(COUNT):
             of, K = (left, own.K) if k >= onset else (np.ones(2), moved.K)
             e = part.y[k] - of * (moved.C @ x + moved.D @ drive[k] + moved.offset_y)

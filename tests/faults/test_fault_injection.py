@@ -23,7 +23,7 @@ def small(**changes):
 
 def by_hand(model, u, x0, state=None, output=None, to_x=None, to_y=None, gain=None, A=None, B=None, reading=None):
     """x(k+1) = A(k) x + B(k) state(k) + to_x(k+1), y(k) = gain(k) (C x + D output(k) + c) + to_y(k), in this order."""
-    f = model.expanded(u)
+    f = model.expand_inputs(u)
     state = f if state is None else state
     output = f if output is None else output
     to_x = np.vstack([np.zeros((len(u), model.nx)) if to_x is None else to_x, np.zeros(model.nx)])
@@ -90,7 +90,7 @@ def test_a_broken_actuator_drives_the_state_at_the_onset(fault, value):
 def test_a_stuck_actuator_stops_every_function_of_its_input():
     model = with_feedback()
     u = 0.5 * np.random.default_rng(3).normal(size=(N, 2))
-    f = model.expanded(u)
+    f = model.expand_inputs(u)
     stop = [model.nonlinearities[i](0.2) for i in (1, 2)]
     state, output = f.copy(), f.copy()
     state[19:, 1:], output[20:, 1:] = stop, stop
@@ -129,7 +129,7 @@ def test_scheduled_matrices_as_arrays_and_as_functions():
 def test_several_faults_at_once_with_feedback():
     model = with_feedback()
     u = 0.5 * np.random.default_rng(3).normal(size=(N, 2))
-    f = model.expanded(u)
+    f = model.expand_inputs(u)
     state, output, to_y, gain, to_x = f.copy(), f.copy(), np.zeros((N, 2)), np.ones((N, 2)), np.zeros((N, 3))
     state[9:, 0] *= 0.5
     output[10:, 0] *= 0.5
@@ -165,7 +165,7 @@ def test_noise_has_the_covariances_of_the_model_and_grows_where_it_is_told():
 def test_cross_covariance_of_the_noises():
     model = with_feedback(feedback=(), E=None, output_of=())
     found = trajectory(model, np.zeros((200_000, 2)), seed=2)
-    offset = model.expanded(np.zeros((1, 2)))[0]
+    offset = model.expand_inputs(np.zeros((1, 2)))[0]
     w = found.x[1:] - found.x[:-1] @ model.A.T - found.y[:-1] @ model.L.T - model.offset_x - model.B @ offset
     v = found.y - found.x @ model.C.T - model.offset_y - model.D @ offset
     together = np.block([[model.noise.Q, model.noise.S], [model.noise.S.T, model.noise.R]])

@@ -40,10 +40,10 @@ def installed(monkeypatch, tmp_path):
         for group, points in groups.items()))
     for folder in (THEIRS, tmp_path):
         monkeypatch.syspath_prepend(str(folder))
-    for cached in (registry.registered, all_kinds):
+    for cached in (registry.find_entry_points, all_kinds):
         cached.cache_clear()
     yield
-    for cached in (registry.registered, all_kinds):
+    for cached in (registry.find_entry_points, all_kinds):
         cached.cache_clear()
 
 

@@ -33,7 +33,7 @@ def dense(model, data, process, output, extra=None):
     part = data.experiments[0]
     u, y, count, n = part.u, part.y, len(part.y), model.nx
     into_state, into_output = extra or (np.zeros((count, n, 0)), np.zeros((count, model.l, 0)))
-    f, size, rows = model.expanded(u), count * n + into_state.shape[2], []
+    f, size, rows = model.expand_inputs(u), count * n + into_state.shape[2], []
     for k in range(count - 1):
         if model.L.any() and np.isnan(y[k]).any():
             continue  # what is fed back is not known
@@ -59,7 +59,7 @@ def dense(model, data, process, output, extra=None):
 def by_hand(model, data, proof, process, output):
     """Add the proof up with loops over the samples; return the sum, what it may be at most, and the weight of x(0)."""
     part, p = data.experiments[0], proof.weights
-    f, x, total = model.expanded(part.u), np.zeros(model.nx), 0.0
+    f, x, total = model.expand_inputs(part.u), np.zeros(model.nx), 0.0
     for k in range(len(part.y)):
         e = part.y[k] - model.C @ x - model.D @ f[k] - model.offset_y
         total += float(np.nansum(p[k] * e))
@@ -109,7 +109,7 @@ def test_noise_within_its_bounds_never_exceeds_a_proof(found):
     model, rng = found.model, np.random.default_rng(0)
     process, output = sigmas(model, 1.5)
     u = levels(N, 1)
-    f = model.expanded(u)
+    f = model.expand_inputs(u)
     largest = 0.0
     for _ in range(60):
         x, y = 20 * rng.standard_normal(3), np.empty((N, 2))

@@ -104,13 +104,13 @@ def test_moving_ends_where_no_single_move_gains(found):
     problem = course_problem(search(found, Fault.step("sensor:y1", 20, 1.5, end=40)), "sensor:y1")
     columns = problem.matrix @ problem.shapes("tv")
     start = np.array([14, 46])
-    kept = problem.moved(columns, start)
-    energy = problem.refitted(columns[:, kept])[1]
-    assert energy <= problem.refitted(columns[:, start])[1] and kept.size == 2
+    kept = problem.move_changes(columns, start)
+    energy = problem.refit(columns[:, kept])[1]
+    assert energy <= problem.refit(columns[:, start])[1] and kept.size == 2
     for i in range(2):
         for k in range(N):
             trial = sorted({*np.delete(kept, i).tolist(), k})
-            assert problem.refitted(columns[:, trial])[1] >= energy - 1e-7
+            assert problem.refit(columns[:, trial])[1] >= energy - 1e-7
 
 
 def test_solvers_that_fail_or_lie(found):

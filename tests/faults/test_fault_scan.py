@@ -36,7 +36,7 @@ def dense(found, white, u, label):
     count, l = white.r.shape  # noqa: E741
     energies, sizes, spreads = [], [], []
     for onset in range(count):
-        G = white.seen(white.predictor.respond(*found.additions(label, count, onset, u), white.present))
+        G = white.whiten_signature(white.predictor.respond(*found.additions(label, count, onset, u), white.present))
         G = G.reshape(count * l, -1)
         nu = np.linalg.lstsq(G, white.r.ravel(), rcond=1e-6)[0]
         energies.append(float(np.sum((G @ nu) ** 2)))
@@ -68,7 +68,7 @@ def compare(found, white, u):
         peak = result.peak(candidate.label)
         assert tested[peak] and abs(energies[peak] - energies[tested].max()) < 1e-7 * (1 + energies[peak])
         np.testing.assert_allclose(
-            result.signature(candidate, 20), white.seen(white.predictor.respond(
+            result.signature(candidate, 20), white.whiten_signature(white.predictor.respond(
                 *found.additions(candidate, len(white.r), 20, u), white.present)))
 
 
@@ -138,11 +138,11 @@ def test_a_scheduled_change_is_the_difference_of_two_predictors(gaps):
         return np.array(errors)
 
     healthy = innovations(99, False, False)
-    np.testing.assert_allclose(white.predictor.whitened(healthy, white.present), white.r, atol=1e-9)
+    np.testing.assert_allclose(white.predictor.whiten(healthy, white.present), white.r, atol=1e-9)
     for label, both in (("process:wear schedule", True), ("process:B schedule", False)):
         energies = []
         for onset in range(1, 60):
-            G = white.predictor.whitened(healthy - innovations(onset, both, True), white.present)
+            G = white.predictor.whiten(healthy - innovations(onset, both, True), white.present)
             np.testing.assert_allclose(result.signature(label, onset)[:, :, 0], G, atol=1e-9)
             energies.append(np.sum(G * white.r) ** 2 / np.sum(G**2))
         row = result.statistic[result.index(label), 1:]
@@ -198,7 +198,7 @@ def test_states_of_the_predictor_with_feedback_and_gaps():
     y = inject(model, u, seed=1)
     y[7, 0] = y[20] = np.nan
     white = whiten(model, Data(u, y, dt=0.5, outputs=["p", "q"]), x0=[0.1, 0.0, -0.1])
-    predicted = white.states @ model.C.T + model.expanded(u) @ model.D.T + model.offset_y
+    predicted = white.states @ model.C.T + model.expand_inputs(u) @ model.D.T + model.offset_y
     np.testing.assert_allclose((y - predicted)[white.present], white.innovations[white.present], atol=1e-9)
 
 

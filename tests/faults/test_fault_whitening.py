@@ -46,7 +46,7 @@ def test_a_missing_reading_is_fed_back_as_predicted():
     a, b = (whiten(model, Data(u, r, dt=0.5, outputs=["p", "q"]), x0="zero") for r in (y, faulty))
     into_state = np.zeros((60, 3, 1))
     into_state[20, :, 0] = [1.0, -1.0, 0.5]
-    signature = a.seen(a.predictor.respond(into_state, np.zeros((60, 2, 1)), a.present))
+    signature = a.whiten_signature(a.predictor.respond(into_state, np.zeros((60, 2, 1)), a.present))
     # the plant feeds back the reading that was lost, so its share of the fault stays unknown to the predictor
     np.testing.assert_allclose(signature[:23, :, 0], (b.r - a.r)[:23], atol=1e-10)
 
@@ -183,7 +183,7 @@ def test_parameters_that_are_not_the_most_likely_ones_deviate_by_what_their_reco
     part, present = data.experiments[0], np.ones((1000, model.l), dtype=bool)
     displacement = np.column_stack([20 * right.root[:, -1], found.root[:, -1]])
     moves, _ = sensitivities(right.model, right.predictor, part, np.zeros(model.nx), present, displacement)
-    seen = right.predictor.flattened(moves, present)
+    seen = right.predictor.whitened_columns(moves, present)
     # the true parameters are not the most likely ones either: sqrt(q) standard deviations off
     assert np.linalg.norm(seen[:, 0] - seen[:, 1]) < 2 * np.sqrt(right.root.shape[1])
     assert np.linalg.norm(seen[:, 0]) > 19

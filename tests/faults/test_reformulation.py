@@ -88,7 +88,7 @@ def clean_outputs(model, count, seed):
     """A record and the outputs without their noise."""
     u = levels(count, seed)
     told = trajectory(model, u, seed=seed)
-    return Data(u, told.y), told.x @ model.C.T + model.expanded(u) @ model.D.T
+    return Data(u, told.y), told.x @ model.C.T + model.expand_inputs(u) @ model.D.T
 
 
 def broken_record(model, fault, seed=0, count=COUNT):
@@ -141,7 +141,7 @@ def test_the_state_before_the_fault_is_that_of_the_predictor(healthy):
     y = data.y.copy()
     y[150, 0] = np.nan  # corrects nothing, and is interpolated where it is fed back
     window = refitting(model, Data(data.u, y), damaged(0, onset=300)).windows[0]
-    steady, f, x = predictor(model), model.expanded(data.u), np.zeros(3)
+    steady, f, x = predictor(model), model.expand_inputs(data.u), np.zeros(3)
     filled = y.copy()
     filled[150, 0] = (y[149, 0] + y[151, 0]) / 2
     for k in range(300):
@@ -163,10 +163,10 @@ def test_sensitivities_are_those_of_finite_differences(healthy, faults, whole, h
     load = replace(faults["process:load"], kind="bias")
     problem = refitting(healthy, data, damaged(1, offsets=(load,)), whole=whole)
     theta = problem.start + 0.02 * np.random.default_rng(0).standard_normal(problem.start.size)
-    r, s = problem.linearised(theta)
+    r, s = problem.linearise(theta)
     assert r.size == problem.readings
     eye = 1e-6 * np.eye(problem.start.size)
-    moved = [(problem.linearised(theta + e)[0] - problem.linearised(theta - e)[0]) / 2e-6 for e in eye]
+    moved = [(problem.linearise(theta + e)[0] - problem.linearise(theta - e)[0]) / 2e-6 for e in eye]
     assert np.abs(np.stack(moved, axis=1) - s).max() < 1e-6 * np.abs(s).max()
 
 
@@ -174,7 +174,7 @@ def test_refit_equals_regularised_least_squares_where_no_rule_binds(healthy):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.4), count=400)
     problem = refitting(healthy, data, damaged(1))
     found = run(actuator(problem, constraints=[]))
-    r, s = problem.linearised(problem.start)
+    r, s = problem.linearise(problem.start)
     curve, half = problem.curves[0], problem.curves[0].half_range
     second = np.diff(np.eye(7), n=2, axis=0) / (0.2 * half)
     rows = np.vstack([
@@ -196,8 +196,8 @@ def test_evidence_is_the_density_of_the_record(healthy):
     found = []
     for curvature in (0.02, 0.1, 0.5):
         problem = refitting(healthy, data, damaged(1), prior=RefitPrior(curvature=curvature))
-        r, s = problem.linearised(problem.start)
-        rows, wanted = problem.believed()
+        r, s = problem.linearise(problem.start)
+        rows, wanted = problem.prior_rows()
         rows, wanted = np.vstack([rows, 2 * np.eye(8)[7:]]), np.append(wanted, 1.0)
         spread = np.linalg.inv(rows.T @ rows)
         full = np.column_stack([s, np.zeros(len(s))])
@@ -263,8 +263,8 @@ def test_gauss_newton_ends_at_a_stationary_point(healthy):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), count=300)
     problem = refitting(healthy, data, damaged(1), whole=True, prior=RefitPrior(healthy=0.05))
     found = run(parameters(problem, constraints=[]), prove=False)
-    r, s = problem.linearised(found.model.theta)
-    rows, wanted = problem.believed()
+    r, s = problem.linearise(found.model.theta)
+    rows, wanted = problem.prior_rows()
     z = np.append(found.model.theta, found.model.lost["u2"])
     gradient = s.T @ r + (rows.T @ (rows @ z - wanted))[:-1]
     size = np.sqrt(np.sum(s**2, axis=0) + np.sum(rows[:, :-1] ** 2, axis=0))

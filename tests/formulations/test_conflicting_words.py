@@ -6,7 +6,7 @@ import pytest
 import optid
 from optid.identify.prediction_error.curvature import Curvature, measure_curvature
 from optid.program.solution import Status
-from optid.statistics.linearised import linearised
+from optid.statistics.linearised import linearise_errors
 
 
 def record(seed):
@@ -63,7 +63,7 @@ def test_measured_curvature_is_that_of_the_sum_of_squares(seed):
         def linearise(x):
             e = errors + matrix @ x + np.einsum("kij,i,j->k", bends, x, x) / 20
             rows = np.column_stack([matrix + np.einsum("kij,j->ki", bends, x) / 10, e])
-            return linearised(lambda _: [(rows, 20)], 1, 0, 3, method="qr")
+            return linearise_errors(lambda _: [(rows, 20)], 1, 0, 3, method="qr")
 
     plain = Bent.linearise(np.zeros(3))
     found = measure_curvature(Bent, np.zeros(3), plain)
@@ -85,14 +85,14 @@ def test_secants_of_a_descent_save_steps_and_keep_the_gradient(seed):
     def at(x):
         e = errors + matrix @ x + np.einsum("kij,i,j->k", bends, x, x) / 20
         rows = np.column_stack([matrix + np.einsum("kij,j->ki", bends, x) / 10, e])
-        return linearised(lambda _: [(rows, 20)], 1, 0, 3, method="qr")
+        return linearise_errors(lambda _: [(rows, 20)], 1, 0, 3, method="qr")
 
     steps = [0, 0]
     for use in (0, 1):
         curvature, x = Curvature(3), np.zeros(3)
         for _ in range(200):
             here = at(x)
-            factor, pull = (curvature.added(here) if use else here).whole
+            factor, pull = (curvature.add_to(here) if use else here).whole
             step = -np.linalg.solve(factor, pull)
             while at(x + step).value > here.value * (1 + 1e-12):
                 step = step / 2
@@ -104,7 +104,7 @@ def test_secants_of_a_descent_save_steps_and_keep_the_gradient(seed):
     plain, other = at(x), Curvature(3)
     gram = plain.whole[0].T @ plain.whole[0]
     other.matrix = 0.4 * gram + 0.02 * np.trace(gram) * np.diag([1.0, 0.0, 2.0])
-    bent = other.added(plain)
+    bent = other.add_to(plain)
     near = 1e-9 * np.abs(gram).max()
     assert bent.pulled == pytest.approx(plain.pulled, abs=near)
     assert bent.whole[0].T @ bent.whole[0] == pytest.approx(gram + other.matrix, abs=near)

@@ -33,7 +33,7 @@ def distance(found, true):
 @pytest.mark.parametrize("basis", BASES, ids=str)
 def test_noise_free_systems_are_recovered_with_every_basis(basis, a, b, nk, form):
     true = siso(basis=basis, a=a, b=(b,), nk=nk, offset=0.05)
-    fit = optid.fit(noise_free(true), form, na=len(a), nb=len(b), nk=nk, basis=basis.fitted(-0.7, 1.3))
+    fit = optid.fit(noise_free(true), form, na=len(a), nb=len(b), nk=nk, basis=basis.with_interval(-0.7, 1.3))
     assert distance(fit.model, true) < 1e-7
     assert fit.one_step_fit[0] > 100 - 1e-4  # the square root of roundoff
     assert fit.solution.objective <= 1e-12 * fit.solution.scale
@@ -42,7 +42,7 @@ def test_noise_free_systems_are_recovered_with_every_basis(basis, a, b, nk, form
 def test_ratio_of_b_is_exact_for_a_function_that_is_not_odd():
     true = siso(nk=0, b=([1.0, 0.75],))
     assert abs(true.nonlinearities[0].mu.sum()) > 0.1  # where the structural null space hurts
-    fit = optid.fit(noise_free(true), na=2, nb=2, basis=Triangular(7).fitted(-0.7, 1.3))
+    fit = optid.fit(noise_free(true), na=2, nb=2, basis=Triangular(7).with_interval(-0.7, 1.3))
     assert abs(fit.model.b[0][1] / fit.model.b[0][0] - 0.75) < 1e-8
 
 
@@ -52,7 +52,7 @@ def test_several_inputs_each_with_its_own_basis_order_and_delay(form):
     true = HammersteinTF([-1.1, 0.4], ([1.0, 0.5], [0.7], [0.3, -0.2, 0.4]),
                           tuple(nonlinearity(basis, seed) for seed, basis in enumerate(bases)), (0, 2, 1), 0.2)
     fit = optid.fit(noise_free(true, 500), form, na=2, nb=[2, 1, 3], nk=[0, 2, 1],
-                    basis=[basis.fitted(-0.7, 1.3) for basis in bases])
+                    basis=[basis.with_interval(-0.7, 1.3) for basis in bases])
     assert distance(fit.model, true) < 1e-7
 
 
@@ -70,7 +70,7 @@ def test_exact_fits_of_random_stable_systems(seed):
     rng = np.random.default_rng(seed)
     poles = rng.uniform(-0.9, 0.9, 3)
     true = HammersteinTF(np.poly(poles)[1:], (rng.normal(size=4),), (nonlinearity(Triangular(5), seed),), (1,), 0.1)
-    fit = optid.fit(noise_free(true), na=3, nb=4, nk=1, basis=Triangular(5).fitted(-0.7, 1.3))
+    fit = optid.fit(noise_free(true), na=3, nb=4, nk=1, basis=Triangular(5).with_interval(-0.7, 1.3))
     assert distance(fit.model, true) < 1e-7
     assert fit.solution.proof
 
@@ -90,7 +90,7 @@ def ragged():
 
 
 def test_compressed_least_squares_equal_those_of_the_dense_regressor():
-    data, bases = ragged(), [Triangular(4).fitted(-0.7, 1.3), Polynomial(2).fitted(-0.7, 1.3)]
+    data, bases = ragged(), [Triangular(4).with_interval(-0.7, 1.3), Polynomial(2).with_interval(-0.7, 1.3)]
     fit = optid.fit(data, "hammerstein_arx.overparametrised", na=2, nb=[2, 1], nk=[0, 1], basis=bases)
     phi, y = dense(data, 2, (2, 1), (0, 1), bases)
     theta, rest, *_ = np.linalg.lstsq(phi, y, rcond=None)
@@ -102,7 +102,7 @@ def test_compressed_least_squares_equal_those_of_the_dense_regressor():
 def test_linear_arx_equals_numpy():
     data = record()
     fit = optid.fit(data, "arx", na=2, nb=3, nk=1)
-    phi, y = dense(data, 2, (3,), (1,), [Linear().fitted(-1, 1)])
+    phi, y = dense(data, 2, (3,), (1,), [Linear().with_interval(-1, 1)])
     theta, rest, *_ = np.linalg.lstsq(phi, y, rcond=None)
     assert np.allclose(np.concatenate([fit.model.a, fit.model.b[0], fit.model.offset]), theta[:, 0], atol=1e-7)
     assert fit.solution.objective == pytest.approx(rest[0], rel=1e-9)
@@ -212,7 +212,7 @@ def test_resolve_along_a_path_of_weights():
     ({"ridge": -1.0}, StructureError, "ridge=-1"),
     ({"loss": "hubr"}, StructureError, "Did you mean 'huber'"),
     ({"basis": "triangular:60"}, RankError, "rows for 123 parameters"),
-    ({"basis": Triangular(6).fitted(-1, 9)}, RankError, "never excited"),
+    ({"basis": Triangular(6).with_interval(-1, 9)}, RankError, "never excited"),
 ])
 def test_bad_structure_names_the_argument_and_the_remedy(change, error, words):
     refuses(error, words, optid.fit, record(count=100), **{"na": 2, "nb": 2, "basis": BASIS} | change)

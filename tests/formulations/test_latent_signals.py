@@ -64,8 +64,8 @@ def test_several_steps_ahead_without_correction_are_the_free_run(model):
 
 
 @pytest.mark.parametrize("change", [
-    lambda model: model.transformed(np.array([[1.0, 0.3, 0.0], [0.0, 2.0, -0.1], [0.4, 0.0, 0.5]])),
-    lambda model: model.injected(0.1 * np.ones((3, 2))),
+    lambda model: model.transform(np.array([[1.0, 0.3, 0.0], [0.0, 2.0, -0.1], [0.4, 0.0, 0.5]])),
+    lambda model: model.inject_output(0.1 * np.ones((3, 2))),
     lambda model: HammersteinSS.from_dict(model.to_dict()),
     lambda model: model.regauge("norm")])
 def test_forms_that_simulate_the_same(change):
@@ -227,7 +227,7 @@ def test_a_signal_out_of_its_interval_is_brought_back():
     x[errors.unknowns.slices["z0"]] = [0.4, -0.6, 1.5, 0.7]
     moved = _renewed(errors, x)[1]
     point = errors.unknowns.unpack(moved)
-    z = np.vstack(errors.visited(point)) @ point.Cz.T + errors.data.experiments[0].u @ point.Dz.T + point.offset_z
+    z = np.vstack(errors.run_states(point)) @ point.Cz.T + errors.data.experiments[0].u @ point.Dz.T + point.offset_z
     assert (z.min(), z.max()) == pytest.approx((-1 / 1.15, 1 / 1.15), abs=1e-6)
     assert np.vstack(errors.residuals(moved)) == pytest.approx(np.vstack(errors.residuals(x)), abs=1e-8)
 
@@ -248,7 +248,7 @@ def test_a_function_that_is_worse_on_the_whole_record_begins_at_zero():
     point = wider.unknowns.unpack(x)
     without = replace(point, cs=(), Ez=point.Ez[:, :0], Fz=point.Fz[:, :0], Cz=point.Cz[:0], Dz=point.Dz[:0],
                       offset_z=point.offset_z[:0])
-    before = errors.normalised(errors.unknowns.pack(without))
+    before = errors.normalise(errors.unknowns.pack(without))
     astray = wider.unknowns.pack(replace(point, Ez=30 * point.Ez, A=0.9 * point.A))
     found, _ = _confirmed(wider, astray, errors, before, wider.data)
     assert np.isfinite(wider.value(found)) and wider.value(found) <= errors.value(before) * (1 + 1e-12)

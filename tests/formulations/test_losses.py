@@ -40,7 +40,7 @@ CASES = [("huber", losses.HUBER), ("huber:0.7", 0.7), ("l1", 0.0)]
 @pytest.mark.parametrize("loss, number", CASES)
 def test_linear_arx_equals_the_raw_sample_problem(loss, number):
     fit = optid.fit(soiled(), "arx", na=2, nb=2, loss=loss)
-    phi, y = dense(soiled(), 2, (2,), (0,), [Linear().fitted(-1, 1)])
+    phi, y = dense(soiled(), 2, (2,), (0,), [Linear().with_interval(-1, 1)])
     value, _ = raw_problem(phi, y, 2, [(1, 2)], sizes(loss[:2], threshold(fit, loss, number)))
     assert fit.solution.objective == pytest.approx(value, rel=1e-7)
     assert value * (1 - 1e-6) <= fit.solution.bound.value <= value * (1 + 1e-8)

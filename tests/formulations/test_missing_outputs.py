@@ -14,7 +14,7 @@ from optid.data.record import Data
 from optid.errors import DataWarning, RankError
 from optid.identify.subspace.imputation import ROUNDS, impute
 from optid.identify.validation import fit_percent
-from optid.registry import registered
+from optid.registry import find_entry_points
 
 gaps = scripts.benchmark("gaps")
 
@@ -30,7 +30,7 @@ def score(cell, data):
 
 
 def test_every_identification_formulation_has_a_case():
-    assert {cell.formulation for cell in CELLS.values()} == set(registered("optid.formulations"))
+    assert {cell.formulation for cell in CELLS.values()} == set(find_entry_points("optid.formulations"))
     assert len(CELLS) == len(gaps.CELLS)
 
 

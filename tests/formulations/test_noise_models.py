@@ -22,7 +22,7 @@ from optid.identify.prediction_error.search import arma
 from optid.models import HammersteinTF, Nonlinearity, roots
 from optid.program.solution import Status
 
-BASIS = Triangular(4).fitted(-1.0, 1.0)
+BASIS = Triangular(4).with_interval(-1.0, 1.0)
 MU = np.array([-0.9, -0.35, 0.5, 0.75])
 A, B, C, D = np.array([-1.2, 0.5]), np.array([1.0, 0.6]), np.array([-0.6, 0.2]), np.array([-0.7])
 
@@ -128,7 +128,7 @@ def test_linear_models():
 
 @pytest.mark.slow
 def test_two_inputs_and_one_common_noise():
-    functions = Nonlinearity(BASIS, MU), Nonlinearity(Polynomial(2).fitted(-1.0, 1.0), [0.8, 0.3])
+    functions = Nonlinearity(BASIS, MU), Nonlinearity(Polynomial(2).with_interval(-1.0, 1.0), [0.8, 0.3])
     plant = HammersteinTF(A, (B / np.linalg.norm(B), [1.0]), functions, (0, 2), 0.1)
     model, rng = replace(plant, c=C), np.random.default_rng(0)
     u = rng.uniform(-1, 1, (5000, 2))
@@ -270,7 +270,7 @@ def test_arma_of_a_signal():
     assert c == pytest.approx(C, abs=0.1) and d == pytest.approx(D, abs=0.06)
     assert arma(signals, 0, 0)[0].size == 0 and arma(signals, 0, 2)[1].size == 2
     assert np.all(arma([np.zeros(50)], 1, 1)[0] == 0)
-    assert roots.radius(roots.contained(np.array([-3.0, 0.5, 0.0]), 0.98)) <= 0.98 + 1e-12
+    assert roots.radius(roots.contain_roots(np.array([-3.0, 0.5, 0.0]), 0.98)) <= 0.98 + 1e-12
 
 
 def test_results_by_name():

@@ -26,8 +26,8 @@ def records_of(rng, lengths, holes=0):
 
 
 def expansion_of(records, feedback=True):
-    bases = [Polynomial(2).fitted(-1, 1), Linear()]
-    return expand(data_of(records), bases, [Polynomial(3).fitted(-1, 1), None] if feedback else None)
+    bases = [Polynomial(2).with_interval(-1, 1), Linear()]
+    return expand(data_of(records), bases, [Polynomial(3).with_interval(-1, 1), None] if feedback else None)
 
 
 def data_of(records):
@@ -192,7 +192,7 @@ def test_feedback_functions_are_orthonormal_on_the_record_and_lose_what_is_linea
     y = rng.standard_normal((500, 2)) @ np.array([[1.0, 0.3], [0.0, 2.0]]) + [3.0, -1.0]
     record = np.hstack([rng.uniform(-1, 1, (500, 2)), y])
     for basis in (Polynomial(4), Triangular(6)):
-        fitted = basis.fitted(float(y[:, 0].min()), float(y[:, 0].max()))
+        fitted = basis.with_interval(float(y[:, 0].min()), float(y[:, 0].max()))
         expansion = expand(data_of([record[:200], record[200:]]), Linear(), [fitted, None])
         family = expansion.feedback[0]
         values = expansion(record)[:, list(expansion.zeta)]

@@ -25,7 +25,7 @@ from optid.models.layout import Layout
 from optid.program.solution import Status
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
-BASIS = Triangular(4).fitted(-0.7, 1.3)
+BASIS = Triangular(4).with_interval(-0.7, 1.3)
 
 
 def record(model=None, count=400, noise=0.2, seed=1):
@@ -55,7 +55,7 @@ def squares(fit, data):
 
 @pytest.mark.parametrize("a, b, nk", [([-1.5, 0.7], [16 / 15, 0.8], 0), ([-0.8], [1.0], 1), ([], [0.5, 0.2, -0.3], 2)],
                          ids=["na2-nb2", "na1-nb1-nk1", "na0-nb3-nk2"])
-@pytest.mark.parametrize("basis", [BASIS, Polynomial(3).fitted(-0.7, 1.3)], ids=["triangular", "polynomial"])
+@pytest.mark.parametrize("basis", [BASIS, Polynomial(3).with_interval(-0.7, 1.3)], ids=["triangular", "polynomial"])
 def test_noise_free_systems_are_recovered(basis, a, b, nk):
     true = siso(basis=basis, a=a, b=(b,), nk=nk, offset=0.05)
     fit = optid.fit(record(true, noise=0.0), "hammerstein_oe.exact", na=len(a), nb=len(b), nk=nk, basis=basis)
@@ -65,7 +65,7 @@ def test_noise_free_systems_are_recovered(basis, a, b, nk):
 
 
 def test_linear_model_of_several_inputs_is_recovered():
-    linear = Nonlinearity(Linear().fitted(-0.7, 1.3), np.ones(1))
+    linear = Nonlinearity(Linear().with_interval(-0.7, 1.3), np.ones(1))
     true = HammersteinTF([-1.1, 0.4], ([1.0, 0.5], [0.3, -0.2, 0.4]), (linear, linear), (0, 2), 0.2)
     fit = optid.fit(record(true, noise=0.0), "oe.exact", na=2, nb=[2, 3], nk=[0, 2])
     assert distance(fit.model, true) < 1e-8
@@ -117,8 +117,9 @@ def test_descent_reaches_the_optimum_of_scipy_from_the_same_start(seed):
     layout = Layout(3, (3,), (seed % 2,), (BASIS,), data.outputs, data.inputs)
     unknowns = TransferUnknowns(layout, 1, (True,))
     criterion = TransferErrors(data, unknowns, "norm", Transform.identity(1, 1))
-    start = criterion.normalised(unknowns.pack(TransferPoint(
-        roots.contained(a + 0.05 * rng.normal(size=3), 0.98), (true.nonlinearities[0].mu + 0.1 * rng.normal(size=4),),
+    start = criterion.normalise(unknowns.pack(TransferPoint(
+        roots.contain_roots(a + 0.05 * rng.normal(size=3),
+                            0.98), (true.nonlinearities[0].mu + 0.1 * rng.normal(size=4),),
         (true.b[0] + 0.1 * rng.normal(size=3),), 0.0, np.zeros((1, unknowns.memory)))))
     ours = descend(criterion, start)
 
@@ -129,7 +130,7 @@ def test_descent_reaches_the_optimum_of_scipy_from_the_same_start(seed):
     assert ours.converged
     assert ours.value <= 2 * theirs.cost * (1 + 1e-9)
     if 2 * theirs.cost <= ours.value * (1 + 1e-6):
-        again = unknowns.unpack(criterion.normalised(theirs.x))
+        again = unknowns.unpack(criterion.normalise(theirs.x))
         here = unknowns.unpack(ours.x)
         assert np.allclose(here.a, again.a, atol=1e-5)
         assert np.allclose(np.outer(here.mus[0], here.bs[0]), np.outer(again.mus[0], again.bs[0]), atol=1e-4)
@@ -249,7 +250,7 @@ def test_standard_errors_agree_with_the_scatter():
 def test_an_optimum_beyond_stability_is_named_and_a_constraint_is_the_remedy():
     rng = np.random.default_rng(0)
     u = rng.normal(size=300)
-    y = by_hand(siso(basis=Linear().fitted(-1, 1), a=[-1.01], b=([1.0],)), u[:, None])  # grows without bound
+    y = by_hand(siso(basis=Linear().with_interval(-1, 1), a=[-1.01], b=([1.0],)), u[:, None])  # grows without bound
     data = optid.Data(u, y + 0.1 * rng.normal(size=y.shape))
     with pytest.warns(DataWarning, match="unit circle"):
         fit = optid.fit(data, "oe.exact", na=1, nb=1)
@@ -324,7 +325,7 @@ def test_constraints_that_hold_anyway_cost_nothing():
 
 @pytest.mark.slow
 def test_the_opposite_gain_is_reached_by_turning_a_sign():
-    linear = Nonlinearity(Linear().fitted(-0.7, 1.3), np.ones(1))
+    linear = Nonlinearity(Linear().with_interval(-0.7, 1.3), np.ones(1))
     data = record(HammersteinTF([-0.8], ([1.0],), (linear,), (0,), 0.0), noise=0.5)
     fit = optid.fit(data, "hammerstein_oe.exact", na=1, nb=1, basis="triangular:2",
                     constraints=[lambda v: {"rising": v.bases["u"].increments() @ v["mu"] >= 0}, "gain:high=-0.1"])
@@ -381,7 +382,8 @@ def test_long_records_are_searched_in_part():
     ({"starts": 0}, StructureError, "starts must be a positive integer"),
     ({"na": 70}, RankError, "150 output samples for 14. unknowns"),
     ({"na": 200}, RankError, "150 samples, but the lags reach back 200"),
-    ({"basis": Triangular(6).fitted(-1, 9)}, RankError, "Function . of 6 of Triangular .*'u'.* is never excited"),
+    ({"basis": Triangular(6).with_interval(-1, 9)}, RankError,
+     "Function . of 6 of Triangular .*'u'.* is never excited"),
     ({"constraints": ["stable:1.5"]}, StructureError, "radius must lie in"),
     ({"constraints": ["stable:0.5", lambda v: {"slow": v["a"][0] <= -1.5}]}, InfeasibleError, "stable:0.5.*slow"),
     ({"constraints": [lambda v: {"odd": v["A"] >= 0}]}, StructureError, "asks for 'A'")])

@@ -264,7 +264,7 @@ def test_bounds_are_part_of_the_proof():
 
 def test_contradictory_words_are_infeasible():
     with pytest.raises(InfeasibleError, match="tau"):
-        fit(record(), constraints=[words.tau(high=10).named("below"), words.tau(low=20).named("tau above")])
+        fit(record(), constraints=[words.tau(high=10).with_name("below"), words.tau(low=20).with_name("tau above")])
 
 
 @pytest.mark.parametrize("word", ["tau:high=60", "dead_time:12", "overdamped", "zeta:0.5", "K:2"])

@@ -16,23 +16,23 @@ from optid.registry import (
     FORMULATIONS,
     RENDERERS,
     check_arguments,
+    find_entry_points,
     formulation,
     named_constraint,
-    registered,
     render,
 )
 
 
 def test_every_entry_point_loads_and_is_callable():
     for group in (FORMULATIONS, CONSTRAINTS, FAULTS, RENDERERS):
-        assert registered(group)
-        for point in registered(group).values():
+        assert find_entry_points(group)
+        for point in find_entry_points(group).values():
             assert callable(point.load())
-    assert set(registered(FORMULATIONS)) >= {"arx", "hammerstein_arx.exact", "hammerstein_arx.nuclear"}
+    assert set(find_entry_points(FORMULATIONS)) >= {"arx", "hammerstein_arx.exact", "hammerstein_arx.nuclear"}
 
 
 def test_every_rule_of_the_catalogue_has_a_word():
-    words = {point.value.split(":")[1] for point in registered(CONSTRAINTS).values()}
+    words = {point.value.split(":")[1] for point in find_entry_points(CONSTRAINTS).values()}
     known = {*shape.__all__, *poles.__all__, *responses.__all__, *process.__all__}
     assert words == known - {"fixed"}  # a known parameter is an array, which no word can carry
 

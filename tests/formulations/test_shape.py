@@ -138,7 +138,7 @@ def test_slack_constraints_change_nothing():
 @pytest.mark.parametrize("parity", ["odd", "even"])
 def test_parity_on_a_symmetric_interval_holds_everywhere_for_every_basis(basis, parity):
     data = record(count=200)
-    fit = optid.fit(data, "hammerstein_arx.overparametrised", na=1, nb=1, basis=basis.fitted(-1, 1),
+    fit = optid.fit(data, "hammerstein_arx.overparametrised", na=1, nb=1, basis=basis.with_interval(-1, 1),
                     constraints=[getattr(shape, parity)()])
     f = shaped(fit.model, GRID)
     assert np.ptp(f + f[::-1] if parity == "odd" else f - f[::-1]) < 1e-7 * max(np.ptp(f), 1e-3)
@@ -149,7 +149,8 @@ def test_parity_on_a_symmetric_interval_holds_everywhere_for_every_basis(basis, 
 @pytest.mark.parametrize("basis", [BSpline(6), Polynomial(4)], ids=str)
 @pytest.mark.parametrize("rule, order", [(shape.monotone(), 1), (shape.convex(), 2)], ids=["monotone", "convex"])
 def test_cones_of_smooth_bases_hold_between_their_points(basis, rule, order):
-    fit = optid.fit(record(count=60, noise=1.5, seed=4), na=1, nb=2, basis=basis.fitted(-1, 1), constraints=[rule])
+    fit = optid.fit(record(count=60, noise=1.5, seed=4), na=1, nb=2, basis=basis.with_interval(-1, 1),
+                    constraints=[rule])
     f = shaped(fit.model, np.linspace(-1, 1, 1501))
     steps = np.diff(f, order) / np.ptp(f)
     assert np.ptp(f) > 0.1
@@ -246,7 +247,7 @@ def named_record():
 
 @pytest.mark.slow
 def test_channels_are_constrained_by_name():
-    bases = [Triangular(5).fitted(-1, 1), Polynomial(3).fitted(-1, 1)]
+    bases = [Triangular(5).with_interval(-1, 1), Polynomial(3).with_interval(-1, 1)]
     fit = optid.fit(named_record(), na=2, nb=2, nk=[0, 1], basis=bases, constraints=[
         shape.monotone(channel="valve"), shape.odd(channel="pump"), shape.gain(1.5, at=0.1, channel="valve")])
     assert [price.name for price in fit.prices] == ["monotone:increasing[valve]", "odd[pump]", "gain[valve]"]
@@ -260,7 +261,7 @@ def test_channels_are_constrained_by_name():
 
 @pytest.mark.slow
 def test_two_channels_share_their_dynamics():
-    fit = optid.fit(named_record(), na=2, nb=2, nk=[0, 1], basis=Triangular(5).fitted(-1, 1),
+    fit = optid.fit(named_record(), na=2, nb=2, nk=[0, 1], basis=Triangular(5).with_interval(-1, 1),
                     constraints=[shape.shared("b", "valve", "pump")])
     assert np.allclose(fit.values["b[valve]"], fit.values["b[pump]"], atol=1e-8)
 
@@ -322,7 +323,7 @@ def test_static_characteristics_do_not_vanish_into_an_integrator():
 
 
 def test_two_of_a_kind_get_names_of_their_own():
-    rules = [shape.through(0.0, 0.5), shape.through(0.5, 2.0).named("second point")]
+    rules = [shape.through(0.0, 0.5), shape.through(0.5, 2.0).with_name("second point")]
     fit = optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=rules)
     assert [price.name for price in fit.prices] == ["through", "second point"]
     with pytest.raises(StructureError, match="two constraints named 'through'"):

@@ -60,7 +60,7 @@ def test_gaps_and_several_experiments():
 
 
 def test_two_inputs_without_a_constant_and_the_gauges():
-    functions = Nonlinearity(BASIS, MU), Nonlinearity(Polynomial(2).fitted(-1.0, 1.0), [0.8, 0.3])
+    functions = Nonlinearity(BASIS, MU), Nonlinearity(Polynomial(2).with_interval(-1.0, 1.0), [0.8, 0.3])
     plant = HammersteinTF(A, (B / np.linalg.norm(B), [1.0]), functions, (0, 2), 0.0)
     rng = np.random.default_rng(0)
     u = rng.uniform(-1, 1, (400, 2))

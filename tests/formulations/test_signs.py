@@ -33,8 +33,8 @@ def test_the_sign_is_that_of_the_static_gain_of_a_stable_plant(seed):
     assert plant_sign(a, b) == np.sign(gain)
     states = as_states(a, b)
     assert states.gain_signs == np.sign(gain)
-    assert states.transformed(rng.normal(size=(4, 4))).gain_signs == np.sign(gain)
-    assert states.injected(rng.normal(size=(4, 1))).gain_signs == np.sign(gain)
+    assert states.transform(rng.normal(size=(4, 4))).gain_signs == np.sign(gain)
+    assert states.inject_output(rng.normal(size=(4, 1))).gain_signs == np.sign(gain)
     matrices = np.array([np.diag(rng.uniform(-0.9, 0.9, 2)) + [[0, 0.3], [0, 0]]])
     several = rng.normal(size=(3, 2))
     gains = np.linalg.solve(np.eye(2) + matrices[0], several.sum(axis=0))
@@ -59,12 +59,12 @@ def test_without_a_static_gain_the_largest_coefficient_decides():
 
 def test_turning_f_and_b_leaves_the_predictions_as_they_are():
     rng = np.random.default_rng(0)
-    f = Nonlinearity(Polynomial(3).fitted(-1, 1), rng.normal(size=3))
+    f = Nonlinearity(Polynomial(3).with_interval(-1, 1), rng.normal(size=3))
     u, y = rng.uniform(-1, 1, (50, 1)), rng.normal(size=(50, 1))
     data = optid.Data(u, y, 1.0)
     for model in (HammersteinTF([-0.5], [[-1.0, 0.2]], (f,), (0,), 0.3),
                   HammersteinSS([[0.5]], [[1.0]], [[1.0]], [[-2.0]], (f,))):
-        turned = model.turned(model.gain_signs)
+        turned = model.with_signs(model.gain_signs)
         assert model.gain_signs == -1 and turned.gain_signs == 1
         assert turned.predict(data) == pytest.approx(model.predict(data), abs=1e-12, nan_ok=True)
         assert turned.nonlinearities[0].mu == pytest.approx(-f.mu)

@@ -13,7 +13,7 @@ from formulations.constraints import shape
 from formulations.constraints.poles import stable
 from optid.errors import StructureError
 from optid.models import HammersteinTF
-from optid.models.roots import pulled
+from optid.models.roots import pull_roots
 from optid.program.limits import Limit
 from optid.program.view import View
 
@@ -56,7 +56,7 @@ def test_the_inner_region_holds_stable_polynomials_only(na, radius):
         poles[1] = np.conj(poles[0])
         reference = np.real(np.poly(poles))[1:]
         a, members = build(stable(radius), na, reference)
-        centre = pulled(reference, 0.98 * radius)
+        centre = pull_roots(reference, 0.98 * radius)
         assert holds(a, members, centre) and largest(centre) < radius
         for size in (0.02, 0.1, 0.4):
             for _ in range(60):

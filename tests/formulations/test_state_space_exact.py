@@ -23,12 +23,12 @@ from optid.data.record import Data
 from optid.errors import DataError, InfeasibleError, RankError, StructureError
 from optid.identify.prediction_error import state_errors
 from optid.identify.prediction_error.state_errors import StateErrors
-from optid.identify.prediction_error.state_search import entered
+from optid.identify.prediction_error.state_search import start_from_model
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.kalman import kalman_gain
 from optid.program.solution import Status
 from optid.statistics.expansion import expand
-from optid.statistics.linearised import linearised
+from optid.statistics.linearised import linearise_errors
 from optid.statistics.state_unknowns import Latent, StateUnknowns, beyond_affine
 
 
@@ -40,12 +40,12 @@ def problem(criterion, missing, fed, experiments=2, n=3, seed=0, basis=None, lat
     for y in ys:
         y[rng.uniform(size=y.shape) < missing] = np.nan
     data = Data(us, ys) if experiments > 1 else Data(us[0], ys[0])
-    bases = [Triangular(4).fitted(-4, 4), Linear()]
-    feedback = [(basis or Polynomial(3)).fitted(-3, 3), None] if fed else None
+    bases = [Triangular(4).with_interval(-4, 4), Linear()]
+    feedback = [(basis or Polynomial(3)).with_interval(-3, 3), None] if fed else None
     expansion = expand(data, bases, feedback)
     unknowns = StateUnknowns(n, expansion, experiments, (True, False), criterion, True, latent, linear_output)
     criterion = StateErrors(data, unknowns, np.array([[2.0, 0.3], [0.3, 0.5]]), Transform.identity(data.m, 2))
-    return criterion, criterion.normalised(0.3 * rng.normal(size=unknowns.size))
+    return criterion, criterion.normalise(0.3 * rng.normal(size=unknowns.size))
 
 
 def weighted_square(criterion, x):
@@ -59,7 +59,7 @@ def weighted_square(criterion, x):
 
 
 def latent_functions():
-    smooth, cells = Polynomial(4).fitted(-2, 2), BSpline(5, interval=(-1.0, 1.0), outside="extrapolate")
+    smooth, cells = Polynomial(4).with_interval(-2, 2), BSpline(5, interval=(-1.0, 1.0), outside="extrapolate")
     return (Latent(smooth, beyond_affine(smooth), direct=True), Latent(cells, np.eye(cells.size), feeds=False, output=1,
                                                                  moved=False))
 
@@ -104,7 +104,7 @@ def test_directions_of_the_gauge_change_nothing(word, latent):
     rows = criterion.gauge_rows(x)
     assert len(rows) == 9 + 2 + bool(latent)  # n^2 changes of states, scales of functions
     assert rows @ rows.T == pytest.approx(np.eye(len(rows)), abs=1e-10)
-    plain = linearised(criterion.rows(x), 2, 3, criterion.unknowns.shared)
+    plain = linearise_errors(criterion.rows(x), 2, 3, criterion.unknowns.shared)
     assert np.abs(plain.root @ rows.T).max() < 1e-5 * np.abs(plain.root).max()
 
 
@@ -112,7 +112,7 @@ def test_vector_of_a_model_and_back():
     criterion, x = problem("prediction", 0.0, True)
     unknowns = criterion.unknowns
     model = criterion.at(unknowns.unpack(x))
-    again = criterion.normalised(unknowns.pack(criterion.point_of(model)))
+    again = criterion.normalise(unknowns.pack(criterion.point_of(model)))
     assert again[: unknowns.shared] == pytest.approx(x[: unknowns.shared], abs=1e-10)
 
 
@@ -141,7 +141,7 @@ def test_scipy_finds_no_better_point(criterion):
     fit = optid.fit(data, linear, nx=2, criterion=criterion, weighting="scale")
     unknowns = StateUnknowns(2, _expansion(data), 1, (True, True), criterion)
     error = StateErrors(data, unknowns, np.diag(1 / data.y.var(axis=0)), Transform.identity(data.m, data.l))
-    x = entered(error, fit.model)
+    x = start_from_model(error, fit.model)
     assert error.linearise(x).value == pytest.approx(fit.solution.objective, rel=1e-8)
     root = np.linalg.cholesky(error.weight).T
 

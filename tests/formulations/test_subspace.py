@@ -65,7 +65,7 @@ def markov(a, c, b, count=8):
 
 def without_injection(model):
     """The model with the linear part of the feedback back in g, as the plant has it."""
-    return model.injected(-model.L)
+    return model.inject_output(-model.L)
 
 
 # -- exact recovery ---------------------------------------------------------------------------------------------------

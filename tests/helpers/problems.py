@@ -12,7 +12,7 @@ import optid
 from optid.bases import Triangular
 from optid.models import HammersteinTF, Nonlinearity
 
-BASIS = Triangular(6).fitted(-1.0, 1.0)
+BASIS = Triangular(6).with_interval(-1.0, 1.0)
 NODES = np.linspace(-1, 1, 7)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 import optid
 from optid.errors import DataWarning, OptidError
-from optid.registry import FORMULATIONS, registered
+from optid.registry import FORMULATIONS, find_entry_points
 
 NUMBERS = (0, 1, 2, 3, 5, -1, 1.5, float("nan"), 10**20, "2", None, True, 40, [1, 2], np.int64(2))
 WEIGHTS = (0.0, 0.1, 1e3, -1.0, float("nan"), float("inf"), 1e300, "huber", None)
@@ -71,8 +71,8 @@ def record(rng: np.random.Generator) -> tuple[object, object]:
 def draw(seed: int) -> tuple[tuple[object, object], str, dict]:
     """Return a record, the name of a formulation, and its arguments, most of which make sense."""
     rng = np.random.default_rng([seed, 77])
-    name = str(rng.choice(sorted(registered(FORMULATIONS))))
-    known = signature(registered(FORMULATIONS)[name].load()).parameters
+    name = str(rng.choice(sorted(find_entry_points(FORMULATIONS))))
+    known = signature(find_entry_points(FORMULATIONS)[name].load()).parameters
     given = {key: value for key, value in USUAL.items() if key in known}
     for _ in range(int(rng.integers(0, 4))):
         key = str(rng.choice([*(k for k in SHARED if k in known), *PLAIN, str(rng.choice(list(SHARED)))]))

@@ -20,7 +20,7 @@ from study_rows import rows
 import optid
 from optid.cli.app import app
 from optid.faults import diagnose, dictionary
-from optid.registry import FORMULATIONS, registered
+from optid.registry import FORMULATIONS, find_entry_points
 from optid.studies.execution.running import run
 from optid.studies.storage.store import append
 from optid.studies.study import Study
@@ -38,7 +38,7 @@ VALUES = {  # by option; then by metavar; a number where neither is known
     "--experiment": ["run", "nope", "u"], "--delimiter": [",", ";", "\\t", "", "ab", "\x00", '"'],
     "--decimal": [".", ",", "", "x", ".."], "--example": [*optid.examples.EXAMPLES, "nope", ""],
     "--scheduler": ["tcp://127.0.0.1:9", "x", ""],
-    "--formulation": [*sorted(registered(FORMULATIONS)), "nope", ""],
+    "--formulation": [*sorted(find_entry_points(FORMULATIONS)), "nope", ""],
     "--solver": ["auto", "auto", "clarabel", "ipopt", "scs", "nope", ""], "--loss": ["squares", "huber", "l1:x", ""],
     "--classes": ["linear", "input functions", "nope"], "--gauge": ["norm", "gain", "b0", "nope"],
     "--kinds": ["bias", "loss", "stuck", "drift", "frozen", "noise", "spike", "nope", "bias,loss"],

@@ -14,12 +14,12 @@ from random_calls import limited
 
 import optid
 from optid.errors import DataError, DataWarning, OptidError, StructureError
-from optid.registry import FORMULATIONS, registered
+from optid.registry import FORMULATIONS, find_entry_points
 from optid.show.documents import fit_document
 from optid.show.page import render
 from optid.show.sections import FAILED
 
-NAMES = sorted(registered(FORMULATIONS))
+NAMES = sorted(find_entry_points(FORMULATIONS))
 SYSTEMS = ("plain", "white", "slow", "unstable", "no effect", "noise-free", "integrator", "feedback", "gaps", "huge",
            "tiny", "levels", "pulse", "constant end", "resonant")
 BASES = ("polynomial:2", "polynomial:3", "triangular:4", "piecewiseconstant:3", "bspline:5", "trigonometric:2",
@@ -68,7 +68,7 @@ def draw(seed: int) -> tuple[str, optid.Data, str, dict[str, Any]]:
     """Return a system, its record, the name of a formulation, and its arguments."""
     rng = np.random.default_rng([seed, 41])
     name, system = NAMES[seed % len(NAMES)], str(rng.choice(SYSTEMS))
-    known = signature(registered(FORMULATIONS)[name].load()).parameters
+    known = signature(find_entry_points(FORMULATIONS)[name].load()).parameters
     m, l = (1 if name == "physical" or rng.random() < 0.7 else 2 for _ in range(2))  # noqa: E741
     several = "nx" in known or name.startswith(("arx", "hammerstein_arx"))
     usual = {"na": rng.integers(0, 4), "nb": rng.integers(1, 4), "nk": rng.integers(0, 3), "nc": rng.integers(1, 3),

@@ -17,7 +17,7 @@ BASES = [Triangular(7),
 
 
 def nonlinearity(basis, seed=0, interval=(-0.7, 1.3)):
-    basis = basis.fitted(*interval)
+    basis = basis.with_interval(*interval)
     return Nonlinearity(basis, np.random.default_rng(seed).normal(size=basis.size))
 
 

@@ -38,7 +38,7 @@ def worse(model: HammersteinTF) -> HammersteinTF:
 
 def feedback_model() -> HammersteinSS:
     """One input and output, a cubic in the feedback."""
-    g = Nonlinearity(optid.Polynomial(3).fitted(-2, 2), [0.0, 0.0, 0.4])
+    g = Nonlinearity(optid.Polynomial(3).with_interval(-2, 2), [0.0, 0.0, 0.4])
     return HammersteinSS([[0.6, 0.2], [-0.1, 0.5]], [[1.0], [0.3]], [[1.0, 0.0]], E=[[-0.3], [0.1]], feedback=(g,))
 
 

@@ -56,7 +56,7 @@ def test_few_levels_are_a_warning_with_the_number():
 
 def test_samples_outside_the_interval_are_counted():
     with pytest.warns(DataWarning, match=r"% of input 'u' lies outside the interval \[-0.5, 0.5\].*'clamp'"):
-        found = examined(basis=BASIS.__class__(6).fitted(-0.5, 0.5))
+        found = examined(basis=BASIS.__class__(6).with_interval(-0.5, 0.5))
     share = float(found[0].split(" %")[0])
     assert share == pytest.approx(100 * np.mean(np.abs(U) > 0.5), rel=0.1)
 
@@ -69,7 +69,7 @@ def test_outliers_are_counted_and_heavy_tails_are_not():
     u = U.copy()
     u[9] = 50
     with pytest.warns(DataWarning, match=r"1 outlier in input 'u' \(sample 9\): check the record"):
-        examined(u=u, basis=BASIS.__class__(6).fitted(-1, 60))
+        examined(u=u, basis=BASIS.__class__(6).with_interval(-1, 60))
     assert examined(y=np.random.default_rng(4).standard_t(1.5, 400) ** 3) == []
 
 

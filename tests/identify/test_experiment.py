@@ -152,7 +152,7 @@ def test_without_feedback_functions_the_promise_is_kept_to_the_last_digit(kind):
     found = design(PENDULUM, kind, amplitude=(-6, 6), rows=8)
     for seed in range(3):
         taken = plants.pendulum(found.u, seed=seed)
-        eta = optid.Polynomial(4).fitted(found.u.min(), found.u.max()).values(taken.u[:, 0])
+        eta = optid.Polynomial(4).with_interval(found.u.min(), found.u.max()).values(taken.u[:, 0])
         windows = np.lib.stride_tricks.sliding_window_view(eta, 8, axis=0).reshape(len(eta) - 7, -1)
         centred = windows - windows.mean(axis=0)
         exact = np.linalg.cond(centred / np.linalg.norm(centred, axis=0), 2)

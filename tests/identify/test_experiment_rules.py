@@ -18,7 +18,7 @@ from optid.identify.design.rules import (
 from optid.identify.record_checks import examine, examine_figures
 
 RNG = np.random.default_rng(0)
-QUARTIC = optid.Polynomial(4).fitted(-1, 1)
+QUARTIC = optid.Polynomial(4).with_interval(-1, 1)
 SINE = signals.sinusoid(3000, frequency=0.0237)
 
 
@@ -33,7 +33,7 @@ def hankel_rank(signals_, rows):
                                             (3, (0.05, 0.131))])
 def test_the_rank_of_the_expanded_regressor_is_what_the_lines_say(p, frequencies):
     u = sum(np.sin(2 * np.pi * f * np.arange(3000) + i) for i, f in enumerate(frequencies)) / len(frequencies)
-    basis = optid.Polynomial(p).fitted(-1, 1)
+    basis = optid.Polynomial(p).with_interval(-1, 1)
     check = check_lines("u", [u], basis, 40)
     assert check.number == hankel_rank(basis.values(u), 40) and check.severity == "error"
     if len(frequencies) == 1:
@@ -52,7 +52,7 @@ def test_few_lags_are_determined_by_a_sinusoid():
 @pytest.mark.parametrize("noise, severity", [(1e-4, "error"), (0.005, "warning"), (0.5, "fine")])
 def test_noise_hides_a_sinusoid_by_degrees(noise, severity):
     u = SINE + noise * RNG.standard_normal(SINE.size)
-    assert check_lines("u", [u], optid.Polynomial(4).fitted(u.min(), u.max()), 10).severity == severity
+    assert check_lines("u", [u], optid.Polynomial(4).with_interval(u.min(), u.max()), 10).severity == severity
 
 
 def test_quantisation_and_missing_samples_do_not_cure_it():
@@ -72,7 +72,7 @@ def test_experiments_at_other_frequencies_add_lines():
 @pytest.mark.parametrize("n", [800, 4000])
 def test_rich_inputs_are_fine(kind, n):
     u = plants.pendulum_input(kind, n)
-    assert check_lines("u", [u], optid.Polynomial(4).fitted(-8, 8), 10).severity == "fine"
+    assert check_lines("u", [u], optid.Polynomial(4).with_interval(-8, 8), 10).severity == "fine"
 
 
 def test_white_steps_and_multisines_are_fine_and_few_lines_are_not():
@@ -102,7 +102,7 @@ def test_levels_against_the_basis():
     assert check_levels("u", np.round(5 * u), BASIS).severity == "warning"
     assert check_levels("u", np.round(5 * u), BASIS, few=0).severity == "fine"
     assert check_levels("u", u, BASIS).severity == "fine"
-    assert check_levels("u", np.sign(u), optid.Linear().fitted(-1, 1)).severity == "fine"
+    assert check_levels("u", np.sign(u), optid.Linear().with_interval(-1, 1)).severity == "fine"
 
 
 def test_condition_numbers_have_a_limit():

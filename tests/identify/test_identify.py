@@ -15,7 +15,7 @@ from tasks import anonymous, die_of_one, fail, hang, slow_square
 import optid
 from optid.bases import Linear
 from optid.errors import DataError, DataWarning, OptidError, RankError, SolverFailed, StructureError
-from optid.identify.blocks import Blocks, joined, pooled_fit
+from optid.identify.blocks import Blocks, join_parts, pooled_fit
 from optid.identify.informativity import Informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.search import identify
@@ -35,7 +35,7 @@ from optid.identify.search.trial import (
     StructureCandidate,
     Trial,
     free_parameters,
-    tried,
+    run_trial,
 )
 from optid.models.layout import Layout
 from optid.statistics import collect
@@ -80,7 +80,7 @@ def test_every_sample_is_left_out_once(lengths):
     for b in range(4):
         for part in blocks.parts[b]:
             seen[part.experiment][part.first : part.last] += 1
-        inside, outside = joined(data, blocks.parts[b]), blocks.without(b)
+        inside, outside = join_parts(data, blocks.parts[b]), blocks.without(b)
         assert inside.n_samples + outside.n_samples <= data.n_samples
         left = np.concatenate([e.y.ravel() for e in outside.experiments])
         assert not np.isin(left, np.concatenate([e.y.ravel() for e in inside.experiments])).any()
@@ -206,27 +206,27 @@ def test_errors_of_smaller_structures_are_those_of_fits_without_the_blocks():
 def test_a_trial_is_given_up_early_and_says_why():
     data = plant(400, cubic=0.5)
     blocks = Blocks.of(data)
-    good = tried(StructureCandidate(INPUTS, "hammerstein_oe.exact",
+    good = run_trial(StructureCandidate(INPUTS, "hammerstein_oe.exact",
                                     {"na": 1, "nb": 1, "nk": [1], "basis": "polynomial:3"}),
                  blocks, None, {}, (), None)
     assert good.complete and good.score > 95 and len(good.by_block) == 4 and good.parameters == 5
-    poor = tried(StructureCandidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, good, {}, (), None)
+    poor = run_trial(StructureCandidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, good, {}, (), None)
     assert not poor.complete and "below the cross-validated fit of the best" in poor.reason and poor.score == -np.inf
-    late = tried(good.candidate, blocks, good, {}, (), None, 1e-3)
+    late = run_trial(good.candidate, blocks, good, {}, (), None, 1e-3)
     assert late.reason == "out of time"
-    refused = tried(StructureCandidate(LINEAR, "arx", {"na": 300, "nb": 300}), blocks, None, {}, (), None)
+    refused = run_trial(StructureCandidate(LINEAR, "arx", {"na": 300, "nb": 300}), blocks, None, {}, (), None)
     assert refused.reason.startswith("RankError") and refused.status == "refused"
 
 
 def test_a_richer_structure_that_follows_the_record_no_better_is_not_cross_validated():
     data = plant(400, noise=0.05)
     blocks = Blocks.of(data)
-    plain = tried(StructureCandidate(LINEAR, "oe.exact", {"na": 1, "nb": 1, "nk": [1]}), blocks, None, {}, (), None)
+    plain = run_trial(StructureCandidate(LINEAR, "oe.exact", {"na": 1, "nb": 1, "nk": [1]}), blocks, None, {}, (), None)
     rich = StructureCandidate(INPUTS, "hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": [1], "basis": "polynomial:3"})
-    found = tried(rich, blocks, plain, {}, (), None)
+    found = run_trial(rich, blocks, plain, {}, (), None)
     assert found.fits == 1 and "less error energy than the best linear model" in found.reason
     assert found.estimation > plain.estimation
-    assert tried(rich, blocks, replace(plain, candidate=replace(rich, kind=INPUTS)), {}, (), None).fits == 5
+    assert run_trial(rich, blocks, replace(plain, candidate=replace(rich, kind=INPUTS)), {}, (), None).fits == 5
 
 
 def test_functions_keep_the_range_of_the_record_where_a_block_is_left_out():
@@ -236,7 +236,7 @@ def test_functions_keep_the_range_of_the_record_where_a_block_is_left_out():
     y = np.convolve(u + 0.5 * u**3, 0.8 ** np.arange(60))[:800]
     blocks = Blocks.of(optid.Data(u, y + 0.01 * rng.normal(size=800)))
     arguments = {"na": 1, "nb": 1, "basis": "polynomial:3"}
-    found = tried(StructureCandidate(INPUTS, "hammerstein_oe.exact", arguments), blocks, None, {}, (), None)
+    found = run_trial(StructureCandidate(INPUTS, "hammerstein_oe.exact", arguments), blocks, None, {}, (), None)
     assert found.by_block.min() > 98
     narrow = optid.fit(blocks.without(3), "hammerstein_oe.exact", **arguments).model
     energy, measure = blocks.errors(narrow, 3)
@@ -257,7 +257,7 @@ def test_fits_without_a_block_go_on_from_the_whole_record(formulation, arguments
         x[k] = 0.7 * x[k - 1] - 0.1 * np.tanh(x[k - 1]) ** 3 + u[k - 1]
     y = x + 0.2 * x**2 if formulation == "wiener_ss.exact" else x
     blocks = Blocks.of(optid.Data(3 + 2 * u, 40 + 7 * y + 0.05 * rng.normal(size=600)))
-    found = tried(StructureCandidate(LATENT, formulation, {"nx": 1, **arguments}), blocks, None, {}, (), None)
+    found = run_trial(StructureCandidate(LATENT, formulation, {"nx": 1, **arguments}), blocks, None, {}, (), None)
     assert found.complete, found.reason
     cold = [optid.fit(blocks.without(b), formulation, nx=1, prove=False, **arguments).model for b in range(4)]
     errors = np.array([blocks.errors(model, b)[0] for b, model in enumerate(cold)])
@@ -293,7 +293,7 @@ def test_a_better_optimum_without_a_block_is_where_the_whole_fit_goes_on(monkeyp
     good = optid.fit(data, "hammerstein_ss.sid", nx=1, basis="linear")
     candidate, blocks = StructureCandidate(LATENT, "lfr.exact", {"nx": 1, "channels": 1}), Blocks.of(data)
     calls = stuck_on_the_whole(monkeypatch, trying, blocks.data, good, before)
-    found = tried(candidate, blocks, None, {}, (), None)
+    found = run_trial(candidate, blocks, None, {}, (), None)
     order = (*blocks.moving[::2], *blocks.moving[1::2])
     assert found.complete and found.restarted == order[before] and found.order == order
     expected = [blocks.errors(good.model, b)[0] for b in range(4)]
@@ -571,7 +571,7 @@ def test_nothing_that_can_be_fitted_is_an_error_with_the_most_frequent_reason(mo
     def refuse(candidate, *_):
         return Trial(candidate, reason="RankError: too short")
 
-    monkeypatch.setattr(searching, "tried", refuse)
+    monkeypatch.setattr(searching, "run_trial", refuse)
     with pytest.raises(SolverFailed, match="most often: RankError: too short"):
         identify(plant(200), workers=1)
 
@@ -588,7 +588,7 @@ def test_a_search_goes_on_from_the_file_of_its_trials(tmp_path, monkeypatch):
     data, file = plant(400, cubic=0.4), tmp_path / "trials.json"
     first = identify(data, classes=KINDS[:2], effort=1e-3, workers=1, trials=file)
     made = []
-    monkeypatch.setattr(searching, "tried", lambda one, *more: made.append(one.key) or tried(one, *more))
+    monkeypatch.setattr(searching, "run_trial", lambda one, *more: made.append(one.key) or run_trial(one, *more))
     second = identify(data, classes=KINDS[:2], workers=1, trials=file)
     whole = identify(data, classes=KINDS[:2], workers=1)
     assert not {t.candidate.key for t in first.trials if t.fits} & set(made[: len(second.trials) - len(first.trials)])
@@ -622,17 +622,18 @@ def test_a_model_that_leaves_the_range_when_the_inputs_come_otherwise_is_dropped
     expected = max(y.min() - run.min(), run.max() - y.max()) / (y.max() - y.min())
     assert blocks.excursion(fit.model) == pytest.approx(max(expected, 0.0), abs=1e-12)
     candidate = StructureCandidate(LATENT, "wiener_ss.exact", {"nx": 1, "output_basis": "polynomial:3"})
-    assert tried(candidate, blocks, None, {}, (), None).complete
+    assert run_trial(candidate, blocks, None, {}, (), None).complete
     monkeypatch.setattr(Blocks, "excursion", lambda *_: 0.6)
-    assert "leaves the range of the outputs" in tried(candidate, blocks, None, {}, (), None).reason
-    assert tried(candidate, blocks, None, {}, (), 1).complete  # predictions do not run freely
-    assert tried(StructureCandidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, None, {}, (), None).complete
+    assert "leaves the range of the outputs" in run_trial(candidate, blocks, None, {}, (), None).reason
+    assert run_trial(candidate, blocks, None, {}, (), 1).complete  # predictions do not run freely
+    assert run_trial(StructureCandidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, None, {}, (),
+                     None).complete
 
 
 def test_functions_of_states_have_one_level_for_all_experiments():
-    data = optid.Data.join(plant(200), plant(200, seed=1).mapped(lambda u: u, lambda y: y + 3))
+    data = optid.Data.join(plant(200), plant(200, seed=1).map_signals(lambda u: u, lambda y: y + 3))
     ladder = Ladder.of(Blocks.of(data), several=True)
     assert ladder.levels_differ
     for kind, formulation, word in ((LINEAR, "oe.exact", "each"), (INPUTS, "hammerstein_oe.exact", "each"),
                                     (LATENT, "wiener_ss.exact", None), (FEEDBACK, "hammerstein_ss.exact", None)):
-        assert ladder.levelled(StructureCandidate(kind, formulation, {"nx": 2})).arguments.get("offset") == word
+        assert ladder.with_levels(StructureCandidate(kind, formulation, {"nx": 2})).arguments.get("offset") == word

@@ -21,7 +21,7 @@ from optid.identify.noise import (
     with_noise,
 )
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import Likelihood, _parts, _run, _slope, covariance_of, refined
+from optid.models.innovation_gain import Likelihood, _parts, _run, _slope, covariance_of, refine_gain
 from optid.models.kalman import NoiseCovariances, kalman_gain
 from optid.show.summary import noise_table
 
@@ -265,7 +265,7 @@ def test_the_search_in_a_part_first_ends_where_the_search_in_all_does(lengths, m
     assert 3000 < sum(map(len, part)) < 0.5 * sum(lengths)
     assert all(any(np.shares_memory(p, r) for r in rest) for p in part)
     searched, likelihood = _most_likely(A, C, rest).gain, Likelihood(A, C, rest)
-    whole = [refined(likelihood, likelihood.at(gain)).gain for gain in (model.K, np.zeros((3, 2)))]
+    whole = [refine_gain(likelihood, likelihood.at(gain)).gain for gain in (model.K, np.zeros((3, 2)))]
     found, *others = (likelihood.at(gain).log_determinant for gain in (searched, *whole))
     assert sum(lengths) / 2 * (found - min(others)) < 0.01
     assert np.max(np.abs(np.linalg.eigvals(A - searched @ C))) < 1

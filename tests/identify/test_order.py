@@ -145,7 +145,7 @@ def test_nonlinear_inputs_and_feedback():
 
 def test_simulated_outputs_follow_the_inputs_alone():
     data = record(3000, noise=0.5)
-    signals = expand(data, Linear(), Polynomial(3).fitted(-9, 9))
+    signals = expand(data, Linear(), Polynomial(3).with_interval(-9, 9))
     (extended,), wider = with_simulated_outputs(data.records, signals, 8)
     clean = lfilter([0, 1.0, 0.4], [1, -1.2, 0.6], data.u[:, 0])
     assert np.isnan(extended[:15, 2]).all() and wider.simulated

@@ -10,9 +10,9 @@ import optid
 from optid.bases import Polynomial
 from optid.data.record import Data
 from optid.errors import RankError
-from optid.identify.tangent import whitened
+from optid.identify.tangent import whiten_directions
 from optid.models import HammersteinSS, Nonlinearity
-from optid.statistics.coloured import long_autoregression, response_of, scattered
+from optid.statistics.coloured import long_autoregression, response_of, score_covariance
 
 CUBIC = Nonlinearity(Polynomial(3, interval=(-1.0, 1.0), outside="extrapolate"), np.array([1.0, 0.3, 0.4]))
 
@@ -54,7 +54,7 @@ def test_a_change_of_the_states_changes_nothing():
     """Directions that change no output have no part in them: other starts, the same intervals."""
     data = record(1, process=0.02)
     one = fitted(data)
-    other = fitted(data, initial=one.model.transformed([[2.0, 0.3], [-0.5, 0.7]]), block_rows=6)
+    other = fitted(data, initial=one.model.transform([[2.0, 0.3], [-0.5, 0.7]]), block_rows=6)
     for row, again in zip(one.uncertainty.table(), other.uncertainty.table()):
         assert again[1:] == pytest.approx(row[1:], rel=1e-4)
 
@@ -137,7 +137,7 @@ def test_scatter_of_coloured_errors_is_that_of_the_whole_covariance(cuts):
     blocks = [(np.column_stack([rows[a:b].reshape(-1, columns), np.zeros(2 * (b - a))]), 0)
               for a, b in zip((0, *cuts), cuts)]
     expected = flat.T @ covariance @ flat
-    assert scattered(blocks, response, root) == pytest.approx(expected, abs=1e-11 * np.abs(expected).max())
+    assert score_covariance(blocks, response, root) == pytest.approx(expected, abs=1e-11 * np.abs(expected).max())
 
 
 def test_long_autoregression_and_its_response():
@@ -155,4 +155,4 @@ def test_a_singular_direction_is_named():
     effect = np.random.default_rng(0).normal(size=(9, 5))
     effect[:, 4] = effect[:, 1] - 2.0 * effect[:, 2]
     with pytest.raises(RankError, match=r"combination of the parameters \(valve, tank\) has no effect"):
-        whitened(effect, np.zeros((0, 5)), {"A": (1,), "valve": (2,), "K": (1,), "tank": (1,)})
+        whiten_directions(effect, np.zeros((0, 5)), {"A": (1,), "valve": (2,), "K": (1,), "tank": (1,)})

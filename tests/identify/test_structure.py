@@ -22,7 +22,7 @@ from optid.identify.validation.checks import record_structure
 from optid.identify.validation.score_tests import FTest, Regression, orthonormal, score_test
 from optid.identify.validation.structure import structure_test
 from optid.identify.validation.structure_alternatives import PRODUCTS, RANK, alternatives
-from optid.identify.validation.structure_design import Design, Family, filtered
+from optid.identify.validation.structure_design import Design, Family, filter_rational
 from optid.identify.validation.structure_hypothesis import fit_hammerstein
 
 benchmark = scripts.benchmark("structure")
@@ -57,7 +57,7 @@ def test_families_by_hand():
 @pytest.mark.parametrize("poles", [[0.6 + 0.3j, 0.6 - 0.3j], [0.9, 0.5], [0.7], []])
 def test_filters_span_the_dynamics_from_the_delay_on(poles):
     poles = np.array(poles, dtype=complex)
-    responses = filtered(np.eye(300, 1), poles, 3)[:, :, 0]
+    responses = filter_rational(np.eye(300, 1), poles, 3)[:, :, 0]
     assert not responses[:3].any() and responses.shape[1] == 8 + 2 * poles.size
     assert np.linalg.cond(responses) < 1e4
     for numerator, a, tolerance in (([1.0], np.real(np.poly(poles)), 1e-12), ([0, 0, 1.0], [1.0], 1e-12),

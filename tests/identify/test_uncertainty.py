@@ -15,7 +15,7 @@ import optid
 from formulations.constraints import shape
 from optid.errors import RankError, StructureError
 from optid.identify.intervals import LocalEstimate, project
-from optid.identify.uncertainty import aligned, uncertainty
+from optid.identify.uncertainty import align_signs, uncertainty
 
 A, B = np.array([-1.2, 0.5]), np.array([0.8, 0.6])
 BASIS = optid.Triangular(4, interval=(-1.0, 1.0))
@@ -356,9 +356,9 @@ def test_a_dead_input_is_refused_by_name():
 def test_alignment_only_flips_signs(plain):
     m = plain.model
     turned = replace(m, b=(-m.b[0],), nonlinearities=(replace(m.nonlinearities[0], mu=-m.nonlinearities[0].mu),))
-    np.testing.assert_array_equal(aligned(turned, m).b[0], m.b[0])
-    np.testing.assert_array_equal(aligned(turned, m).nonlinearities[0].mu, m.nonlinearities[0].mu)
-    assert aligned(m, m) is m
+    np.testing.assert_array_equal(align_signs(turned, m).b[0], m.b[0])
+    np.testing.assert_array_equal(align_signs(turned, m).nonlinearities[0].mu, m.nonlinearities[0].mu)
+    assert align_signs(m, m) is m
 
 
 def determined(fit):

@@ -143,9 +143,9 @@ def test_neither_dynamics_nor_curves_depend_on_the_gauge():
 
 
 def test_a_step_response_ends_at_the_difference_of_the_static_characteristic():
-    f = Nonlinearity(Polynomial(3).fitted(-1, 2), [0.3, 1.0, 0.2])
+    f = Nonlinearity(Polynomial(3).with_interval(-1, 2), [0.3, 1.0, 0.2])
     plant = HammersteinTF([-1.2, 0.5], [[0.3, 0.4]], (f,), (2,), 0.3)
-    feedback = Nonlinearity(Polynomial(3).fitted(-3, 3), [0.2, 0.0, -0.05])
+    feedback = Nonlinearity(Polynomial(3).with_interval(-3, 3), [0.2, 0.0, -0.05])
     states = HammersteinSS([[0.5]], [[0.5]], [[1.0]], None, (f,), E=[[0.3]], feedback=(feedback,))
     for model in (plant, states):
         (rest, step), reasons = responses(model, [(-1.0, 2.0)])

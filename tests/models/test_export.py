@@ -107,7 +107,7 @@ def test_casadi_in_a_predictive_controller():
 
 
 def test_user_functions_are_called_with_symbols():
-    functions = UserFunctions((np.tanh, lambda v: v**3 + np.exp(-v)), ("tanh", "mixed")).fitted(-1, 1)
+    functions = UserFunctions((np.tanh, lambda v: v**3 + np.exp(-v)), ("tanh", "mixed")).with_interval(-1, 1)
     model = siso(nonlinearities=(Nonlinearity(functions, [1.0, -0.4]),))
     u = np.random.default_rng(3).uniform(-1.4, 1.4, (60, 1))
     state = np.array([[0.4], [-0.3]])
@@ -115,12 +115,13 @@ def test_user_functions_are_called_with_symbols():
 
 
 def test_a_user_function_that_takes_arrays_only_is_refused():
-    functions = UserFunctions((special.j1,), ("bessel",)).fitted(-1, 1)
+    functions = UserFunctions((special.j1,), ("bessel",)).with_interval(-1, 1)
     refuses(StructureError, "CasADi scalar", siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi)
 
 
 def test_a_user_function_that_means_something_else_of_symbols_is_refused():
-    functions = UserFunctions((lambda v: v * (2.0 if isinstance(v, np.ndarray) else 3.0),), ("two",)).fitted(-1, 1)
+    functions = UserFunctions((lambda v: v * (2.0 if isinstance(v, np.ndarray) else 3.0),), ("two",)).with_interval(-1,
+                                                                                                                    1)
     refuses(StructureError, "other values", siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi)
 
 

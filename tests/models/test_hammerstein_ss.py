@@ -14,7 +14,7 @@ from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
-from optid.models.feedback_tables import tabulated
+from optid.models.feedback_tables import tabulate
 from optid.models.kalman import kalman_gain
 
 MODELS = [linear(), linear(n=1, m=1, outputs=1), *(with_feedback(basis) for basis in FEEDBACK_BASES)]
@@ -102,7 +102,7 @@ def test_tables_equal_the_nonlinearity(basis):
 
     f = nonlinearity(basis, 3, (-1.0, 2.0))
     points = np.linspace(-2.5, 3.5, 1001) + 1e-7
-    tables = tabulated([nonlinearity(Linear()), f])
+    tables = tabulate([nonlinearity(Linear()), f])
     if not tables.compiled:
         assert basis is USER
         return
@@ -257,38 +257,38 @@ def agree(one, other, data, tolerance=1e-10):
 def test_predictions_do_not_depend_on_the_states(model):
     data = record(model, missing=0.1)
     T = np.random.default_rng(4).normal(size=(3, 3))
-    moved = model.transformed(T)
+    moved = model.transform(T)
     agree(model, moved, data)
     assert moved.poles == pytest.approx(model.poles)
     assert moved.impulse_response(10) == pytest.approx(model.impulse_response(10), abs=1e-12)
     assert moved.frequency_response([0.1, 1.0]) == pytest.approx(model.frequency_response([0.1, 1.0]), abs=1e-11)
     assert moved.static_gain([0.1, 0.2]) == pytest.approx(model.static_gain([0.1, 0.2]), abs=1e-9)
-    refuses(StructureError, "singular", model.transformed, np.ones((3, 3)))
-    refuses(StructureError, "T has shape", model.transformed, np.eye(2))
+    refuses(StructureError, "singular", model.transform, np.ones((3, 3)))
+    refuses(StructureError, "T has shape", model.transform, np.eye(2))
 
 
 @pytest.mark.parametrize("model", [linear(), with_feedback()])
 def test_balanced_gramians(model):
-    found = model.balanced()
+    found = model.balance()
     agree(model, found, record(model))
     driven = np.hstack([found.B, found.E])
     reach = scipy.linalg.solve_discrete_lyapunov(found.A, driven @ driven.T)
     see = scipy.linalg.solve_discrete_lyapunov(found.A.T, found.C.T @ found.C)
     assert reach == pytest.approx(see, abs=1e-8) and reach == pytest.approx(np.diag(np.diag(reach)), abs=1e-8)
-    refuses(StructureError, "unstable", linear(radius=1.1).balanced)
-    refuses(StructureError, "not minimal", HammersteinSS(np.diag([0.5, 0.4]), [[1.0], [0.0]], [[1.0, 1.0]]).balanced)
+    refuses(StructureError, "unstable", linear(radius=1.1).balance)
+    refuses(StructureError, "not minimal", HammersteinSS(np.diag([0.5, 0.4]), [[1.0], [0.0]], [[1.0, 1.0]]).balance)
 
 
 def test_injection_leaves_prediction_and_free_run_alone():
     model = with_feedback()
     data = record(model)
-    moved = model.injected(np.random.default_rng(0).normal(size=(3, 2)))
+    moved = model.inject_output(np.random.default_rng(0).normal(size=(3, 2)))
     assert moved.predict(data) == pytest.approx(model.predict(data), abs=1e-9)
     assert moved.simulate(data, x0=X0) == pytest.approx(model.simulate(data, x0=X0), abs=1e-9)
     assert not np.allclose(moved.simulate_measured_feedback(data, x0=X0), model.simulate_measured_feedback(data, X0))
-    absorbed = model.injected(-model.L)
+    absorbed = model.inject_output(-model.L)
     assert not absorbed.L.any() and absorbed.A == pytest.approx(model.A + model.L @ model.C)
-    refuses(StructureError, "gain has shape", model.injected, np.ones((2, 3)))
+    refuses(StructureError, "gain has shape", model.inject_output, np.ones((2, 3)))
 
 
 @pytest.mark.parametrize("gauge", ["norm", "none"])
@@ -300,7 +300,7 @@ def test_predictions_do_not_depend_on_the_gauge(model, gauge):
     if gauge == "norm":
         assert np.linalg.norm(np.vstack([found.B, found.D]), axis=0) == pytest.approx(np.ones(found.B.shape[1]))
         assert np.linalg.norm(found.E, axis=0) == pytest.approx(np.ones(len(found.feedback)))
-        assert found.transformed(3 * np.eye(3)).regauge("norm").impulse_response(5)[0] * 0 == pytest.approx(0 * found.D)
+        assert found.transform(3 * np.eye(3)).regauge("norm").impulse_response(5)[0] * 0 == pytest.approx(0 * found.D)
         closed = np.eye(found.nx) - found.A - found.L @ found.C
         gains = found.C @ np.linalg.solve(closed, found.B + found.L @ found.D) + found.D
         assert (gains[np.abs(gains).argmax(axis=0), range(gains.shape[1])] > 0).all()
@@ -353,7 +353,7 @@ def test_static_gain_is_the_slope_between_equilibria():
 def test_the_static_curve_of_an_input_leaves_the_functions_of_the_others_out():
     model, points = with_feedback(), np.array([-0.2, 0.3])
     alone = replace(model, nonlinearities=tuple(
-        f if c == 0 else f.scaled(0.0) for f, c in zip(model.nonlinearities, model.input_of)))
+        f if c == 0 else f.times(0.0) for f, c in zip(model.nonlinearities, model.input_of)))
     for u, y in zip(points, model.static_curve(0, points)):
         assert y == pytest.approx(alone.simulate(np.tile([u, 0.0], (500, 1)))[-1], abs=1e-9)
 
@@ -390,7 +390,7 @@ def test_without_states_it_is_a_static_map():
     assert model.simulate(np.arange(3.0)) == pytest.approx([1.0, 3.0, 5.0])
     data = Data(np.arange(3.0), [1.0, 3.0, 5.5])
     assert model.predict(data)[:, 0] == pytest.approx([1.0, 3.0, 5.0]) and model.is_stable
-    assert model.balanced() is model and HammersteinSS.from_dict(model.to_dict()).nx == 0
+    assert model.balance() is model and HammersteinSS.from_dict(model.to_dict()).nx == 0
 
 
 # -- leaving -----------------------------------------------------------------------------------------------------------

@@ -238,12 +238,12 @@ def test_refusals():
 
 def test_reflection_keeps_the_spectrum():
     c = np.real(np.poly([1.6, -0.5, 1.2 + 0.5j, 1.2 - 0.5j]))[1:]
-    inside = roots.contained(c)
+    inside = roots.contain_roots(c)
     assert roots.radius(inside) < 1
     z = np.exp(1j * np.linspace(0, 3, 7))
     ratio = np.abs(np.polyval(np.r_[1, c], z)) / np.abs(np.polyval(np.r_[1, inside], z))
     assert ratio == pytest.approx(np.full(7, ratio[0]), rel=1e-10)
-    assert roots.contained(np.array([0.5, 0.0])) == pytest.approx([0.5, 0.0])
+    assert roots.contain_roots(np.array([0.5, 0.0])) == pytest.approx([0.5, 0.0])
 
 
 def test_unstable_armax_predicts():

@@ -45,7 +45,7 @@ def test_no_outputs_of_a_model_without_past_outputs(tmp_path):
 
 
 def test_user_functions_are_asked_for(tmp_path):
-    basis = UserFunctions((np.tanh,), ("tanh",)).fitted(-1, 1)
+    basis = UserFunctions((np.tanh,), ("tanh",)).with_interval(-1, 1)
     model = siso(nonlinearities=(Nonlinearity(basis, [2.0]),))
     path = model.save(tmp_path / "m.json")
     refuses(StructureError, "'tanh'.*functions=", load, path)

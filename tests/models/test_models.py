@@ -40,8 +40,8 @@ def test_nonlinearity_equals_its_expansion(basis):
 
 
 def test_nonlinearity_refuses_wrong_coefficients():
-    refuses(StructureError, r"needs \(7,\)", Nonlinearity, Triangular(7).fitted(0, 1), np.ones(8))
-    refuses(StructureError, r"mu\[1\]", Nonlinearity, Triangular(2).fitted(0, 1), np.array([1.0, np.nan]))
+    refuses(StructureError, r"needs \(7,\)", Nonlinearity, Triangular(7).with_interval(0, 1), np.ones(8))
+    refuses(StructureError, r"mu\[1\]", Nonlinearity, Triangular(2).with_interval(0, 1), np.array([1.0, np.nan]))
 
 
 # -- simulation and prediction ---------------------------------------------------------------------------------------
@@ -286,7 +286,7 @@ def test_raw_units_mimo_and_linear():
 
 
 def test_user_functions_keep_their_units():
-    functions = UserFunctions((np.tanh,), ("tanh",)).fitted(-1, 1)
+    functions = UserFunctions((np.tanh,), ("tanh",)).with_interval(-1, 1)
     with pytest.raises(StructureError, match="keeps the units"):
         siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).with_transform(Transform((2.0,), (0.0,), (1.0,), (0.0,)))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from optid.models.recursions import SHORT, lfilter, propagated
+from optid.models.recursions import SHORT, lfilter, propagate
 from optid.statistics.sensitivities import _all_pole
 
 
@@ -29,7 +29,7 @@ def test_what_grows_is_not_finite():
 def test_states_by_a_triangular_system_are_those_of_the_recursion(n, count, d):
     rng = np.random.default_rng(n)
     matrix, drive = rng.standard_normal((n, n)) / n, rng.standard_normal((count, n, d))
-    found, expected = propagated(matrix, drive), np.empty((count, n))
+    found, expected = propagate(matrix, drive), np.empty((count, n))
     for i in range(d):
         x = np.zeros(n)
         for k in range(count):

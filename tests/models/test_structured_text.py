@@ -52,7 +52,8 @@ class Block:
 
 
 def user():
-    functions = UserFunctions((np.tanh, lambda v: v**3 + np.exp(-v) + np.sin(v)), ("tanh", "mixed")).fitted(-1, 1)
+    functions = UserFunctions((np.tanh, lambda v: v**3 + np.exp(-v) + np.sin(v)), ("tanh", "mixed")).with_interval(-1,
+                                                                                                                   1)
     return siso(nonlinearities=(Nonlinearity(functions, [1.0, -0.4]),), nk=1)
 
 
@@ -87,7 +88,7 @@ def test_a_name_that_the_language_does_not_take_is_refused(name, tmp_path):
 
 
 def test_a_function_that_the_language_does_not_have_is_named(tmp_path):
-    functions = UserFunctions((np.floor,), ("floor",)).fitted(-1, 1)
+    functions = UserFunctions((np.floor,), ("floor",)).with_interval(-1, 1)
     model = siso(nonlinearities=(Nonlinearity(functions, [1.0]),))
     refuses(StructureError, "IEC 61131-3 has no function for floor", model.to_st, tmp_path / "a.st")
     assert model.to_c(tmp_path / "a.c").exists()

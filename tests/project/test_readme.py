@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from optid.cli.app import app
 from optid.conformance.checks import check_formulation
 from optid.examples import example
-from optid.registry import FORMULATIONS, registered
+from optid.registry import FORMULATIONS, find_entry_points
 
 HOME = Path(__file__).parents[2]
 PAGES = [HOME / "README.md", *sorted((HOME / "docs").glob("*.md"))]
@@ -112,7 +112,7 @@ def test_the_readme_is_short_and_its_links_lead_somewhere():
     assert text.count("\n") <= 150
     links = re.findall(r"\]\(([^)#]+)", text)
     assert len(links) > 8 and [link for link in links if not (HOME / link).exists()] == []
-    assert f"{len(registered(FORMULATIONS))} formulations" in text
+    assert f"{len(find_entry_points(FORMULATIONS))} formulations" in text
 
 
 def test_the_formulation_of_the_contributing_guide_is_conformant():

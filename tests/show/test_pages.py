@@ -26,7 +26,7 @@ def dated_fit():
     """A fit of a record of 60 hours, with something to say of it."""
     data = example_fit("thruster").data
     found = optid.Data(data.u, data.y, 360.0, "current", "thrust", start="2024-05-01T06:00")
-    return optid.fit(found.mapped(lambda u: u, lambda y: y, findings=("clock 't': in h, read as seconds",)),
+    return optid.fit(found.map_signals(lambda u: u, lambda y: y, findings=("clock 't': in h, read as seconds",)),
                      "hammerstein_arx.exact", na=2, nb=1, basis="triangular:4")
 
 

@@ -74,7 +74,7 @@ def test_a_test_record_is_drawn_instead_of_the_estimation_record():
 @given(arrays(float, st.integers(1, 6000), elements=st.floats(-1e6, 1e6) | st.just(np.nan)))
 def test_thinning_keeps_the_extremes_and_the_order(y):
     t = np.arange(y.size, dtype=float)
-    thin_t, thin_y = panels.thinned(t, y)
+    thin_t, thin_y = panels.thin_line(t, y)
     assert thin_t.size <= max(panels.POINTS, 1) and np.all(np.diff(thin_t) > 0)
     assert np.array_equal(thin_y, y[thin_t.astype(int)], equal_nan=True)
     if not np.isnan(y).all():

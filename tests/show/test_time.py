@@ -20,7 +20,7 @@ from optid.identify.responses import responses
 from optid.models import HammersteinTF
 from optid.show import charts, printing
 from optid.show.notebook import fit_html, search_html
-from optid.show.page import coded
+from optid.show.page import encode_chart
 from optid.show.responses import curve_charts
 
 FINDING = "no time column: 1 sample = 1; pass dt= (seconds)"
@@ -94,7 +94,7 @@ def test_there_is_no_heading_without_findings(dated):
 
 
 def test_many_findings_are_counted_not_listed(clockless):
-    data = clockless.mapped(lambda u: u, lambda y: y, findings=tuple(f"finding {k}" for k in range(40)))
+    data = clockless.map_signals(lambda u: u, lambda y: y, findings=tuple(f"finding {k}" for k in range(40)))
     text = str(optid.fit(data, "arx", na=1, nb=2))
     assert "- finding 5\n" in text and "- finding 6\n" not in text and "- and 34 more" in text
     assert "<li>and 34 more" in report.render(optid.fit(data, "arx", na=1, nb=2))
@@ -200,7 +200,7 @@ def test_records_with_dates_and_with_numbers_are_not_joined():
 
 
 def test_a_joined_record_keeps_every_finding(clockless):
-    other = clockless.mapped(lambda u: u, lambda y: y, findings=("another",))
+    other = clockless.map_signals(lambda u: u, lambda y: y, findings=("another",))
     joined = optid.Data.join(clockless, other)
     assert joined.findings == (FINDING, "another")
 
@@ -231,7 +231,7 @@ def test_figures_of_seconds_and_samples_say_so():
 @pytest.mark.parametrize("n", [30, 300, 50_000])
 def test_a_page_carries_dates_to_the_microsecond(n):
     data = record(n, dt=0.1, start="2024-05-01T06:00:00.3")
-    axis, series = (coded(charts.time_charts(data, 0, [])[0])[key] for key in ("x", "series"))
+    axis, series = (encode_chart(charts.time_charts(data, 0, [])[0])[key] for key in ("x", "series"))
     start = np.datetime64("2024-05-01T06:00:00.3", "us").astype(int) / 1e6
     assert axis["dates"] and abs(axis["start"] - start) < 1e-6 and axis["step"] == 0.1
     xs = series[0]["xs"]
@@ -241,7 +241,7 @@ def test_a_page_carries_dates_to_the_microsecond(n):
 
 
 def test_the_start_of_an_undated_record_is_told_to_the_page():
-    assert coded(charts.time_charts(record(dt=0.1), 0, [])[0])["x"]["start"] == 0.0
+    assert encode_chart(charts.time_charts(record(dt=0.1), 0, [])[0])["x"]["start"] == 0.0
 
 
 # -- faults
@@ -262,7 +262,7 @@ def broken(plant, **clock):
 
 def test_an_onset_is_printed_with_its_date(plant, tmp_path):
     data = broken(plant, dt=0.1, start="2024-05-01T06:06:32")
-    found = diagnose(plant, data.mapped(lambda u: u, lambda y: y, findings=(FINDING,)))
+    found = diagnose(plant, data.map_signals(lambda u: u, lambda y: y, findings=(FINDING,)))
     onset = found.best.faults[0]
     date = f"2024-05-01 06:06:{32 + onset.onset / 10:04.1f}".removesuffix(".0")
     assert f"sample {onset.onset} ({date})" in str(found) and f"({date})" in found.explain()

@@ -97,8 +97,8 @@ def test_three_channels_with_constraints():
     functions = tuple(nonlinearity(Triangular(4), seed, (-1, 1)) for seed in range(3))
     true = HammersteinTF([-0.8], ([1.0, 0.5], [-0.7, 0.2], [0.4, 0.4]), functions, (0, 0, 0), 0.1)
     data = record(model=true, count=300, noise=0.5)
-    free = optid.fit(data, na=1, nb=2, basis=Triangular(4).fitted(-1, 1))
-    fit = optid.fit(data, na=1, nb=2, basis=Triangular(4).fitted(-1, 1), constraints=["monotone:increasing"])
+    free = optid.fit(data, na=1, nb=2, basis=Triangular(4).with_interval(-1, 1))
+    fit = optid.fit(data, na=1, nb=2, basis=Triangular(4).with_interval(-1, 1), constraints=["monotone:increasing"])
     assert fit.solution.residuals.violation < 1e-8
     assert free.solution.objective < fit.solution.objective
     for f in fit.model.nonlinearities:

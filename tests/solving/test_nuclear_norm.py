@@ -68,7 +68,7 @@ def test_adjoints_and_gram_matrices(form, missing, seed):
     v, z = rng.normal(size=problem.y.shape), rng.normal(size=problem.shape)
     assert np.sum(problem.hankel(v) * z) == pytest.approx(np.sum(v * problem.hankel_adjoint(z)))
     gram, separate = problem.gram
-    through = problem.hankel_adjoint(problem.projected(problem.hankel(v)))
+    through = problem.hankel_adjoint(problem.remove_predictor(problem.hankel(v)))
     assert np.allclose(through, gram @ v if separate else (gram @ v.ravel()).reshape(v.shape))
     if form == "predictor":
         theta = rng.normal(size=(problem.parameters, problem.l))
@@ -76,7 +76,7 @@ def test_adjoints_and_gram_matrices(form, missing, seed):
         assert inner == pytest.approx(np.sum(theta * problem.predictor.adjoint(z, problem.l)))
         columns = [problem.predictor.apply(e[:, None]).ravel() for e in np.eye(problem.parameters)]
         assert np.allclose(np.array(columns) @ np.array(columns).T, problem.predictor.gram)
-        rest = problem.projected(z)
+        rest = problem.remove_predictor(z)
         assert np.max(np.abs(problem.predictor.adjoint(rest, problem.l))) < 1e-9
 
 
@@ -119,7 +119,7 @@ def test_any_dual_point_gives_a_bound_on_any_point(form, missing, seed, weight):
         bound, point = problem.dual(multipliers, weight)
         assert np.linalg.norm(point, 2) <= 1 + 1e-9
         v = problem.data + rng.normal(size=problem.y.shape) * rng.choice([0.0, 0.1, 1.0])
-        theta = problem.explained(problem.hankel(v))
+        theta = problem.predictor_coefficients(problem.hankel(v))
         assert bound <= problem.value(v, theta, weight) * (1 + 1e-9)
         # what free variables demand of a dual point
         pull = problem.hankel_adjoint(point)

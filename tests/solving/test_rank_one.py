@@ -30,7 +30,7 @@ def alternate(problem: RankOne, start: Point, sweeps: int = 5000) -> float:
     for _ in range(sweeps):
         _, *mus = solved([np.einsum("njp,j->np", piece, b) for piece, b in zip(pieces, bs)])
         w, *bs = solved([piece @ mu for piece, mu in zip(pieces, mus)])
-        point = Point(w, tuple(mus), tuple(bs)).normalised()
+        point = Point(w, tuple(mus), tuple(bs)).normalise()
         mus, bs, before, value = list(point.mus), list(point.bs), value, problem.value(point.lift())
         if before - value <= 1e-12 * max(value, 1e-16 * problem.scale):
             break

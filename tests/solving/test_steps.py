@@ -12,7 +12,7 @@ from optid.backends.choice import back_ends
 from optid.cli.results import solver_choice
 from optid.errors import DataWarning, LookupFailed, OptidError, SolverRefused, StructureError
 from optid.program.solution import Status
-from optid.registry import FORMULATIONS, defaults, formulation, registered
+from optid.registry import FORMULATIONS, defaults, find_entry_points, formulation
 from optid.solving.steps import choose_solvers, takers
 from optid.solving.steps import steps as declare_steps
 
@@ -29,7 +29,7 @@ ARGUMENTS = {
     "physical": {"equations": optid.Equations(lambda v: {"x": v["a"] * v["x"] + v["b"] * v["u"], "y": v["x"]},
                                               {"x": 0.1}, {"a": 0.5, "b": 1.0}, time="discrete")},
 }
-NAMES = sorted(registered(FORMULATIONS))
+NAMES = sorted(find_entry_points(FORMULATIONS))
 SOLVERS = sorted(name for name, one in back_ends().items() if one.installed)
 JUDGED = {Status.OPTIMAL, Status.LOCAL, Status.INACCURATE, Status.LIMIT}
 

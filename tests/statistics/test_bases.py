@@ -28,7 +28,7 @@ BASES = [
     Triangular(1), Triangular(7), Trigonometric(3), Polynomial(5), BSpline(5), BSpline(4, degree=2),
     BSpline(6, degree=1), BSpline(3, degree=4), PiecewiseConstant(6), Linear(), CUBE,
 ]  # fmt: skip
-FITTED = [basis.fitted(-0.7, 1.3) for basis in BASES]
+FITTED = [basis.with_interval(-0.7, 1.3) for basis in BASES]
 SMOOTH = [basis for basis in FITTED if not isinstance(basis, (Triangular, PiecewiseConstant))]
 
 
@@ -77,17 +77,17 @@ def test_complete_local_family_sums_to_one_also_when_extrapolating(basis):
 
 
 def test_triangular_is_linear_interpolation_and_mu_are_values_less_the_reference():
-    basis = Triangular(8).fitted(-1.0, 3.0)
+    basis = Triangular(8).with_interval(-1.0, 3.0)
     mu = np.random.default_rng(1).normal(size=8)
     node_values = np.insert(mu, basis.dropped, 0.0)
     assert basis.nodes[basis.dropped] == 0.0
     u = np.linspace(-2, 4, 400)
     assert basis.values(u) @ mu == pytest.approx(np.interp(u, basis.nodes, node_values), abs=1e-13)
-    assert Triangular(4).fitted(2.0, 6.0).nodes[Triangular(4).fitted(2.0, 6.0).dropped] == 4.0
+    assert Triangular(4).with_interval(2.0, 6.0).nodes[Triangular(4).with_interval(2.0, 6.0).dropped] == 4.0
 
 
 def test_triangular_extrapolates_along_the_end_slopes():
-    basis = Triangular(5, outside="extrapolate").fitted(-1.0, 1.0)
+    basis = Triangular(5, outside="extrapolate").with_interval(-1.0, 1.0)
     mu = np.random.default_rng(2).normal(size=5)
     slopes = basis.slope_rows() @ mu
     ends = basis.values([-1.0, 1.0]) @ mu
@@ -96,7 +96,7 @@ def test_triangular_extrapolates_along_the_end_slopes():
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 5])
 def test_bspline_equals_scipy_inside_and_extrapolated(degree):
-    basis = BSpline(6, degree, outside="extrapolate").fitted(-0.5, 2.0)
+    basis = BSpline(6, degree, outside="extrapolate").with_interval(-0.5, 2.0)
     coefficients = np.random.default_rng(3).normal(size=basis.full_size)
     mu = np.delete(coefficients - coefficients[basis.dropped], basis.dropped)
     spline = Spline(basis.knots, coefficients, degree)
@@ -110,15 +110,15 @@ def test_bspline_equals_scipy_inside_and_extrapolated(degree):
 def test_legendre_and_trigonometric_closed_forms():
     v = np.linspace(-1, 1, 50)
     u = 3 + 2 * v
-    assert Polynomial(3).fitted(1, 5).values(u) == pytest.approx(
+    assert Polynomial(3).with_interval(1, 5).values(u) == pytest.approx(
         np.column_stack([v, 1.5 * v**2 - 0.5, 2.5 * v**3 - 1.5 * v])
     )
     expected = [g(np.pi * j * v / 1.25) for j in (1, 2) for g in (np.cos, np.sin)]
-    assert Trigonometric(2).fitted(1, 5).values(u) == pytest.approx(np.column_stack(expected))
+    assert Trigonometric(2).with_interval(1, 5).values(u) == pytest.approx(np.column_stack(expected))
 
 
 def test_piecewise_constant_has_one_level_a_cell_and_the_last_cell_is_closed():
-    basis = PiecewiseConstant(4).fitted(0.0, 4.0)
+    basis = PiecewiseConstant(4).with_interval(0.0, 4.0)
     first, weights = basis.local([0.0, 0.99, 1.0, 3.5, 4.0, -1.0, 9.0])
     assert first.tolist() == [0, 0, 1, 3, 3, 0, 3]
     assert weights.shape == (7, 1)
@@ -144,7 +144,7 @@ def test_beyond_the_interval_it_may_go_on_straight(basis):
 
 
 def test_user_slopes_by_differences_when_not_given():
-    basis = UserFunctions((np.sin,), ("sine",)).fitted(-1, 1)
+    basis = UserFunctions((np.sin,), ("sine",)).with_interval(-1, 1)
     assert basis.slopes(np.linspace(-1, 1, 20)).ravel() == pytest.approx(np.cos(np.linspace(-1, 1, 20)), abs=1e-9)
 
 
@@ -180,7 +180,7 @@ def test_curvature_makes_f_convex(basis):
         assert np.min(np.diff(basis.values(points) @ mu, n=2)) >= -1e-7
 
 
-@pytest.mark.parametrize("basis", [FITTED[1], BSpline(6, 1).fitted(0, 1), BSpline(6, 2).fitted(0, 1)])
+@pytest.mark.parametrize("basis", [FITTED[1], BSpline(6, 1).with_interval(0, 1), BSpline(6, 2).with_interval(0, 1)])
 def test_shape_rows_are_necessary_where_they_claim_to_be_exact(basis):
     assert basis.shape_exact
     rng = np.random.default_rng(7)
@@ -205,9 +205,9 @@ def test_slope_rows_bound_the_slope(basis):
 
 
 @pytest.mark.parametrize("basis", [
-    Polynomial(5).fitted(-0.7, 1.3), Polynomial(1).fitted(2, 3), Polynomial(12).fitted(-1, 1),
-    Triangular(5).fitted(-1, 2), PiecewiseConstant(400).fitted(0, 1), BSpline(5, 2).fitted(-1, 1),
-    BSpline(6, 3).fitted(0, 2)], ids=repr)
+    Polynomial(5).with_interval(-0.7, 1.3), Polynomial(1).with_interval(2, 3), Polynomial(12).with_interval(-1, 1),
+    Triangular(5).with_interval(-1, 2), PiecewiseConstant(400).with_interval(0, 1), BSpline(5, 2).with_interval(-1, 1),
+    BSpline(6, 3).with_interval(0, 2)], ids=repr)
 def test_bounds_on_rows_are_bounds_between_all_points(basis):
     rng = np.random.default_rng(11)
     lo, hi = basis.interval
@@ -273,10 +273,10 @@ def test_error_outside_names_sample_and_value(basis):
 @given(scale=st.floats(1e-3, 1e3), offset=st.floats(-50, 50))
 def test_change_of_units(basis, scale, offset):
     if isinstance(basis, UserFunctions):
-        refuses(StructureError, "keeps the units", basis.mapped, scale, offset)
+        refuses(StructureError, "keeps the units", basis.in_units, scale, offset)
         return
     basis = with_outside(basis, "extrapolate")
-    new, matrix, constant = basis.mapped(scale, offset)
+    new, matrix, constant = basis.in_units(scale, offset)
     u = np.linspace(-0.69, 1.29, 41) + 1e-3
     assert new.values(scale * u + offset) @ matrix + constant == pytest.approx(
         basis.values(u), abs=1e-6 * (1 + 1 / scale)
@@ -339,11 +339,11 @@ def test_parse_refuses(text, error, words):
         lambda: Triangular(3, interval=(0, np.inf)),
         lambda: Trigonometric(3, half_range=0.5),
         lambda: Triangular(3).values([0.0]),
-        lambda: Triangular(3).fitted(0, 1).penalty(3),
+        lambda: Triangular(3).with_interval(0, 1).penalty(3),
         lambda: UserFunctions(()),
         lambda: UserFunctions((np.sin,), ("a", "b")),
-        lambda: UserFunctions((np.ones_like,), ("one",)).fitted(0, 1),
-        lambda: UserFunctions((lambda u: np.sin(u) ** 2, lambda u: np.cos(u) ** 2), ("s", "c")).fitted(0, 1),
+        lambda: UserFunctions((np.ones_like,), ("one",)).with_interval(0, 1),
+        lambda: UserFunctions((lambda u: np.sin(u) ** 2, lambda u: np.cos(u) ** 2), ("s", "c")).with_interval(0, 1),
         lambda: UserFunctions((lambda u: 3.0,), ("three",), interval=(0, 1)),
         lambda: from_dict({"type": "triangular", "cells": 3}),
     ],
@@ -355,9 +355,9 @@ def test_bad_arguments(build):
 
 def test_constant_input_and_wrong_shape():
     with pytest.raises(DataError, match="constant at 2"):
-        Triangular(3).fitted(2.0, 2.0)
+        Triangular(3).with_interval(2.0, 2.0)
     with pytest.raises(DataError, match="finite"):
-        Triangular(3).fitted(np.nan, 2.0)
+        Triangular(3).with_interval(np.nan, 2.0)
     with pytest.raises(DataError, match=r"\(N,\)"):
-        Triangular(3).fitted(0, 1).values(np.zeros((4, 2)))
-    assert Triangular(3, interval=(0, 1)).fitted(5, 6).interval == (0, 1)
+        Triangular(3).with_interval(0, 1).values(np.zeros((4, 2)))
+    assert Triangular(3, interval=(0, 1)).with_interval(5, 6).interval == (0, 1)

@@ -14,7 +14,7 @@ from test_reduction import STRUCTURE, assert_same_fit, frame_of, record_folders,
 
 import optid
 from optid.data import clusters
-from optid.data.clusters import check_workers, connected, difference
+from optid.data.clusters import check_workers, connect_cluster, difference
 from optid.errors import ClusterError, DataError, RankError
 from optid.statistics import Layout, collect
 
@@ -72,7 +72,7 @@ def test_triangular_factors_are_reduced_too(client):
     y = np.convolve(u + 0.3 * u**2, [1.0, 0.5])[:3000] + 1e6 + 0.01 * rng.standard_normal(3000)
     array = da.from_array(np.column_stack([u, y]), chunks=(400, 2))
     stream = optid.open_stream(array, columns=["u", "y"], scheduler=client)
-    bases = (optid.Triangular(4).fitted(-1, 1),)
+    bases = (optid.Triangular(4).with_interval(-1, 1),)
     layout = Layout(na=2, nb=(2,), nk=(0,), bases=bases, outputs=("y",), inputs=("u",))
     there, whole = collect(stream, layout), collect(optid.Data(u=u, y=y), layout)
     assert there.method == whole.method == "qr"
@@ -137,7 +137,7 @@ def test_errors_of_the_record_come_back_as_they_are(record, folders, client):
 
 
 def refused(scheduler):
-    with pytest.raises(ClusterError) as caught, connected(scheduler):
+    with pytest.raises(ClusterError) as caught, connect_cluster(scheduler):
         pass
     return str(caught.value)
 

@@ -73,7 +73,7 @@ def test_large_transient_does_not_cost_digits():
 def test_signals_are_expanded_chunk_by_chunk():
     rng = np.random.default_rng(1)
     u = rng.uniform(-1, 1, (5000, 1))
-    basis, seen = Polynomial(3).fitted(-1, 1), []
+    basis, seen = Polynomial(3).with_interval(-1, 1), []
 
     def expand(raw):
         seen.append(len(raw))

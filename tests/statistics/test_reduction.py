@@ -75,7 +75,7 @@ def test_joining_changes_nothing_that_it_is_given(case):
             np.testing.assert_array_equal(run.total.complete(), complete)
         return merge(runs)
 
-    stream.reduced = reduced
+    stream.reduce = reduced
     total_of_parts(stream, layout, partial(Sums, Frame.of(layout)), chunk, 1)
     np.testing.assert_array_equal(*seen[0])
 

@@ -38,7 +38,7 @@ class Chunks:
 
 
 def layout_of(data, bases, na, nb, nk):
-    fitted = tuple(basis.fitted(-1, 1) for basis in bases)
+    fitted = tuple(basis.with_interval(-1, 1) for basis in bases)
     return Layout(na=na, nb=tuple(nb), nk=tuple(nk), bases=fitted, outputs=data.outputs, inputs=data.inputs)
 
 
@@ -220,7 +220,7 @@ def test_order_of_the_columns():
 def test_recovers_a_system_without_noise():
     rng = np.random.default_rng(4)
     u, y = rng.uniform(-1, 1, 4000), np.zeros(4000)
-    basis = Triangular(8).fitted(-1, 1)
+    basis = Triangular(8).with_interval(-1, 1)
     mu, b, a, offset = rng.standard_normal(8), np.array([0.8, 0.6]), np.array([-1.5, 0.7]), 0.3
     f = basis.values(u) @ mu
     for k in range(2, 4000):
@@ -348,7 +348,7 @@ def test_sample_outside_is_named(threads):
 
 def test_arguments_are_refused():
     data = random_data(np.random.default_rng(16), [100], 2, 1)
-    basis = Triangular(3).fitted(-1, 1)
+    basis = Triangular(3).with_interval(-1, 1)
     good = {"na": 1, "nb": (1, 1), "nk": (0, 0), "bases": (basis, basis), "outputs": ("y",), "inputs": ("u1", "u2")}
     for change, words in (({"nb": (1,)}, "nb has 1 entries for 2 inputs"), ({"na": -1}, "na must be"),
                           ({"nk": (0, -1)}, "nk of input 'u2'"), ({"nb": (0, 1)}, "nb of input 'u1'"),

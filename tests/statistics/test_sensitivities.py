@@ -20,7 +20,7 @@ def case(seed=0, constant=True):
     ys[0][5:9] = np.nan
     ys[1][20] = np.nan
     data = optid.Data([rng.uniform(-1, 1, (n, 2)) for n in lengths], ys)
-    bases = (Triangular(4, (-1, 1)), Linear().fitted(-1, 1))
+    bases = (Triangular(4, (-1, 1)), Linear().with_interval(-1, 1))
     layout = Layout(3, (2, 3), (0, 2), bases, ("y",), ("u1", "u2"))
     unknowns = TransferUnknowns(layout, 2, (True, False), constant)
     poles = [0.8, 0.5 + 0.3j, 0.5 - 0.3j]
@@ -117,7 +117,7 @@ def test_directions_without_effect_get_weight_and_change_nothing():
 def test_ill_conditioned_sensitivities_are_factorised_by_qr():
     rng = np.random.default_rng(1)
     data = optid.Data(rng.normal(size=400), rng.normal(size=400))
-    layout = Layout(4, (4,), (0,), (Linear().fitted(-3, 3),), ("y",), ("u",))
+    layout = Layout(4, (4,), (0,), (Linear().with_interval(-3, 3),), ("y",), ("u",))
     unknowns = TransferUnknowns(layout, 1, (False,))
     nearly = np.poly([0.99, 0.985, 0.98, 0.975])[1:]
     point = TransferPoint(nearly, (np.ones(1),), (np.array([1.0, 0.5, 0.2, 0.1]),), 0.0, np.zeros((1, 4)))

@@ -11,7 +11,7 @@ from study_rows import rows
 from optid.errors import DatabaseError, DataError, OptidError
 from optid.studies.storage.export import export
 from optid.studies.storage.rows import COLUMNS, NAMES
-from optid.studies.storage.store import Store, append, finished, read_rows, rows_of_one
+from optid.studies.storage.store import Store, append, finished_rows, read_rows, rows_of_one
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def test_rows_come_back_as_they_went_in(path):
     append(path, made[150:])
     found = read_rows(path)
     assert tuple(found) == NAMES
-    assert finished(path) == {(row["key"], row["repetition"]) for row in made}
+    assert finished_rows(path) == {(row["key"], row["repetition"]) for row in made}
     for column in COLUMNS:
         want = [row[column.name] for row in made]
         got = found[column.name]
@@ -75,7 +75,7 @@ def test_a_batch_with_a_row_that_is_none_changes_nothing(path):
     append(path, made[:5])
     with pytest.raises(ValueError, match="no column is called"):
         append(path, [*made[5:], {**made[0], "strange": 1}])
-    assert len(finished(path)) == 5
+    assert len(finished_rows(path)) == 5
 
 
 def test_only_the_cells_of_the_grid_as_it_is_now_keep_their_rows_and_former_ones_come_back(path):
@@ -86,10 +86,10 @@ def test_only_the_cells_of_the_grid_as_it_is_now_keep_their_rows_and_former_ones
     with Store(path, write=True) as store:
 
         def aside(study=None):
-            return sum(store.superseded(study).values())
+            return sum(store.count_superseded(study).values())
 
         store.keep("synthetic", identities[:6])
-        assert finished(path, "synthetic") == set(identities[:6]) and len(finished(path, "another")) == 1
+        assert finished_rows(path, "synthetic") == set(identities[:6]) and len(finished_rows(path, "another")) == 1
         assert aside() == aside("synthetic") == 4 and aside("another") == 0
         late = {**made[8], "objective": 5.0, "started": "2027-01-01T00:00:00+00:00"}
         store.append([late])
@@ -99,7 +99,7 @@ def test_only_the_cells_of_the_grid_as_it_is_now_keep_their_rows_and_former_ones
         assert found == [(row["key"], row["objective"]) for row in (*made[6:8], late, made[9])]
         assert aside() == 1
         store.keep("synthetic", [])
-        assert store.finished("synthetic") == set() and aside() == 11
+        assert store.finished_rows("synthetic") == set() and aside() == 11
 
 
 def test_studies_in_one_database_do_not_touch_each_other(path):
@@ -107,7 +107,7 @@ def test_studies_in_one_database_do_not_touch_each_other(path):
     append(path, made)
     append(path, [{**row, "study": "another"} for row in made[:4]])
     assert [read_rows(path, name)["key"].size for name in ("synthetic", "another")] == [10, 4]
-    assert len(finished(path, "another")) == 4 and read_rows(path)["key"].size == 14
+    assert len(finished_rows(path, "another")) == 4 and read_rows(path)["key"].size == 14
 
 
 def test_of_rows_of_several_studies_one_that_is_done_comes_first_then_the_newest(path):
@@ -145,7 +145,7 @@ def test_no_rows_are_not_exported(path, tmp_path):
 
 
 def test_no_rows_yet(path):
-    assert finished(path) == set()
+    assert finished_rows(path) == set()
     append(path, [])
     assert read_rows(path)["objective"].shape == (0,)
 
@@ -176,7 +176,7 @@ def test_files_of_another_kind_or_version_are_told_with_what_to_do(tmp_path, nam
     path = tmp_path / name
     make(path) if callable(make) else path.write_bytes(make)
     content = path.read_bytes()
-    for attempt in (lambda: read_rows(path), lambda: append(path, rows(1)), lambda: finished(path)):
+    for attempt in (lambda: read_rows(path), lambda: append(path, rows(1)), lambda: finished_rows(path)):
         with pytest.raises(DatabaseError, match=words):
             attempt()
     assert path.read_bytes() == content
@@ -201,7 +201,7 @@ def test_damaged_databases_are_named_and_end_in_time(path, seed):
             a, b = 4096 * rng.integers(0, len(content) // 4096, 2)
             damaged[a : a + 4096], damaged[b : b + 4096] = damaged[b : b + 4096], damaged[a : a + 4096]
         path.write_bytes(damaged)
-        for attempt in (read_rows, finished, lambda there: append(there, rows(1))):
+        for attempt in (read_rows, finished_rows, lambda there: append(there, rows(1))):
             try:
                 attempt(path)
             except DatabaseError as error:
@@ -229,7 +229,7 @@ def test_a_run_under_way_can_be_read_and_leaves_one_file(path):
     with Store(path, write=True) as store:
         for k, row in enumerate(made):
             store.append([row])
-            assert len(finished(path)) == k + 1
+            assert len(finished_rows(path)) == k + 1
     read_rows(path)
     assert [file.name for file in path.parent.iterdir()] == ["study.sqlite"]
 
@@ -244,7 +244,7 @@ def test_a_second_connection_of_the_writer_gives_up_none_of_its_locks(path):
     with Store(path, write=True) as store:
         for k, row in enumerate(made):
             store.append([row])
-            finished(path)  # here
+            finished_rows(path)  # here
             there = subprocess.run([sys.executable, "-c", reader], capture_output=True, text=True, check=True)
             assert int(there.stdout) == k + 1
 
@@ -261,7 +261,7 @@ def test_two_processes_write_into_one_database(path):
                                 name])
                for name in ("one", "two")]
     assert [process.wait() for process in started] == [0, 0]
-    assert [len(finished(path, name)) for name in ("one", "two")] == [60, 60]
+    assert [len(finished_rows(path, name)) for name in ("one", "two")] == [60, 60]
 
 
 def test_texts_in_csv_are_no_formulas_and_parquet_has_them_as_they_are(path, tmp_path):

@@ -263,10 +263,10 @@ def test_a_formulation_that_fits_some_of_the_data_is_left_to_the_run():
 def test_a_broken_formulation_of_a_third_party_is_told(monkeypatch):
     from importlib.metadata import EntryPoint
 
-    from optid.registry import FORMULATIONS, registered
+    from optid.registry import FORMULATIONS, find_entry_points
 
-    known = {**registered(FORMULATIONS), "mine": EntryPoint("mine", "no_such_package:mine", FORMULATIONS)}
-    monkeypatch.setattr("optid.studies.definition.registered",
+    known = {**find_entry_points(FORMULATIONS), "mine": EntryPoint("mine", "no_such_package:mine", FORMULATIONS)}
+    monkeypatch.setattr("optid.studies.definition.find_entry_points",
                         lambda group: known if group == FORMULATIONS else {})
     found = problems(SMALL.replace('"arx"', '"mine"').replace('constraints = ["monotone:increasing"]', ""))
     assert found == ["formulation[0].formulation: formulation 'mine' cannot be loaded: ModuleNotFoundError: "
@@ -491,7 +491,7 @@ def test_versions_change_the_key(monkeypatch):
     study = Study.from_text(SMALL)
     before = {cell.key for cell in grid.cells(study)}
     grid.determining.cache_clear()
-    monkeypatch.setattr(grid, "installed", lambda name: "99")
+    monkeypatch.setattr(grid, "installed_version", lambda name: "99")
     assert not before & {cell.key for cell in grid.cells(study)}
     monkeypatch.undo()
     grid.determining.cache_clear()

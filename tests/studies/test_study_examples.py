@@ -96,9 +96,10 @@ def test_the_table_in_the_documentation_says_that_nothing_is_unverified():
     text = (FOLDER / "who_solves_what.md").read_text()
     assert '"optimal"; 0 of them without' in text.replace("\n", " ")
     names = {entry.formulation for entry in read("who_solves_what").formulations}
-    from optid.registry import FORMULATIONS, registered
+    from optid.registry import FORMULATIONS, find_entry_points
 
-    shipped = {name for name, point in registered(FORMULATIONS).items() if point.value.startswith("formulations.")}
+    shipped = {name for name,
+               point in find_entry_points(FORMULATIONS).items() if point.value.startswith("formulations.")}
     # physical is for equations of one's own, process.exact for inputs that move a few times
     assert names == shipped - {"physical", "process.exact"} and all(f"`{name}" in text for name in names)
 

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, STATUSES, as_json, complete
-from optid.studies.storage.store import Store, append, finished, read_rows
+from optid.studies.storage.store import Store, append, finished_rows, read_rows
 
 TEXT = st.text(st.characters(exclude_categories=()), max_size=40)
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True)
@@ -57,7 +57,7 @@ def test_rows_survive_the_database(batch):
                 back = store.rows_of(study, [(row["key"], row["repetition"]) for row in mine])
             for row, found in zip(mine, back, strict=True):
                 assert found == row
-        assert finished(path) == set(identities)
+        assert finished_rows(path) == set(identities)
         assert read_rows(path)["key"].size == len(batch)
 
 

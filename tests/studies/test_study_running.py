@@ -20,7 +20,7 @@ from optid.studies.execution import running
 from optid.studies.execution.executors import run_here
 from optid.studies.execution.running import run, run_to_frame
 from optid.studies.storage.rows import NAMES
-from optid.studies.storage.store import Store, finished, read_rows
+from optid.studies.storage.store import Store, finished_rows, read_rows
 from optid.studies.study import Study
 
 STUDY = Study("trouble", (DataEntry("none", system="dead_zone"),),
@@ -65,7 +65,7 @@ def test_a_second_run_recomputes_nothing(path, grid):
     grid([cell(k) for k in range(10)])
     seen = []
     hands = Hands()
-    rows = run(STUDY, path, execute=hands, progress=lambda *found: seen.append((*found, len(finished(path)))))
+    rows = run(STUDY, path, execute=hands, progress=lambda *found: seen.append((*found, len(finished_rows(path)))))
     assert hands.ran == list(range(10)) and [int(r["key"], 16) for r in rows] == hands.ran
     assert seen[0] == (0, 10, None, 0) and [one[2] for one in seen[1:]] == rows  # given back as they were made
     assert [(done, total, there) for done, total, _, there in seen] == [(k, 10, k) for k in range(11)]
@@ -82,10 +82,10 @@ def test_what_is_finished_is_kept_when_something_stops_the_run(path, grid, error
     hands = Hands(4, error)
     with pytest.raises(error):
         run(STUDY, path, execute=hands)
-    assert hands.closed and len(finished(path)) == 4
+    assert hands.closed and len(finished_rows(path)) == 4
     rest = Hands()
     run(STUDY, path, execute=rest)
-    assert rest.ran == [4, 5, 6, 7, 8, 9] and len(finished(path)) == 10
+    assert rest.ran == [4, 5, 6, 7, 8, 9] and len(finished_rows(path)) == 10
 
 
 def test_an_error_of_the_caller_s_progress_keeps_what_is_finished(path, grid):
@@ -98,13 +98,13 @@ def test_an_error_of_the_caller_s_progress_keeps_what_is_finished(path, grid):
     hands = Hands()
     with pytest.raises(OSError):
         run(STUDY, path, execute=hands, progress=progress)
-    assert hands.closed and len(finished(path)) == 3
+    assert hands.closed and len(finished_rows(path)) == 3
 
 
 def test_rows_nobody_asked_for_and_doubles_are_left_out(path, grid):
     grid([cell(k) for k in range(3)])
     rows = run(STUDY, path, execute=lambda todo: iter([row(c) for c in [*todo, cell(7), *todo]]))
-    assert len(rows) == 3 == len(finished(path))
+    assert len(rows) == 3 == len(finished_rows(path))
 
 
 @pytest.mark.parametrize("settings, words", [
@@ -123,7 +123,7 @@ def test_cells_that_come_back_without_a_row_are_told(path, grid):
     grid([cell(k) for k in range(3)])
     with pytest.raises(StudyError, match="2 cells of 3 returned no row"):
         run(STUDY, path, execute=lambda todo: iter([row(todo[0])]))
-    assert len(finished(path)) == 1
+    assert len(finished_rows(path)) == 1
 
 
 def test_refused_cells_need_no_worker(path, grid):
@@ -167,11 +167,11 @@ def test_other_labels_and_other_studies_take_over_what_is_there(path, grid):
     grid([replace(c, solver="renamed") for c in cells])
     hands = Hands()
     rows = run(STUDY, path, execute=hands)
-    assert hands.ran == [] and {r["solver"] for r in rows} == {"renamed"} and len(finished(path)) == 4
+    assert hands.ran == [] and {r["solver"] for r in rows} == {"renamed"} and len(finished_rows(path)) == 4
     grid([replace(c, study="another") for c in cells])
     rows = run(replace(STUDY, name="another"), path, execute=hands)
     assert hands.ran == [] and {r["study"] for r in rows} == {"another"}
-    assert [len(finished(path, name)) for name in ("trouble", "another")] == [4, 4]
+    assert [len(finished_rows(path, name)) for name in ("trouble", "another")] == [4, 4]
     before = read_rows(path)["started"].size
     run(replace(STUDY, name="another"), path, execute=hands)
     assert read_rows(path)["started"].size == before == 8
@@ -193,7 +193,7 @@ def test_changed_data_are_refused_unless_told(path, grid):
     with pytest.raises(StudyError, match="data changed since the last run.*\n.*mine: /somewhere/x.csv"):
         run(STUDY, path, execute=made)
     rows = run(STUDY, path, execute=made, accept_changed_data=True)
-    assert {r["data_hash"] for r in rows} == {"b" * 64} and len(finished(path)) == 3
+    assert {r["data_hash"] for r in rows} == {"b" * 64} and len(finished_rows(path)) == 3
     run(STUDY, path, execute=made)
 
 
@@ -336,7 +336,7 @@ def test_every_trouble_in_one_study(path, grid):
     assert [r["outcome"] for r in rows] == ["done", "crashed", "done", "time limit", "memory limit", "crashed", "error",
                                             "done", "error", "done"]
     assert all(r["reason"] for r in rows if r["outcome"] != "done")
-    assert len(finished(path)) == 10
+    assert len(finished_rows(path)) == 10
 
 
 def test_a_real_study_from_python_to_its_frame():
@@ -400,10 +400,10 @@ def test_killed_at_any_moment_and_run_again_every_cell_is_there_once(path, tmp_p
         driver.kill()
         driver.wait()
         if path.exists():
-            assert len(finished(path)) <= begun()  # it opens
+            assert len(finished_rows(path)) <= begun()  # it opens
     cells = grid([cell(k, seconds=0.0, log=str(log)) for k in range(count)])
     rows = run(STUDY, path, execute=partial(run_here, function=behave, workers=2))
-    assert [r["key"] for r in rows] == [c.key for c in cells] and len(finished(path)) == count
+    assert [r["key"] for r in rows] == [c.key for c in cells] and len(finished_rows(path)) == count
     assert begun() <= count + 3 * 4  # run twice: at most what three kills found in flight, with one waiting each
 
 
@@ -433,7 +433,7 @@ except DatabaseError as error:
     assert "study.sqlite cannot be written: " in words
     kept = re.search(r"([\d,]+) of 3,000 cells are kept\. Where the disk is full, free space; the same run", words)
     assert kept is not None, words
-    assert len(finished(path)) == int(kept[1].replace(",", "")) == int(ran) - 1
+    assert len(finished_rows(path)) == int(kept[1].replace(",", "")) == int(ran) - 1
     grid([cell(k) for k in range(3000)])
     rest = Hands()
     assert len(run(STUDY, path, execute=rest)) == 3000

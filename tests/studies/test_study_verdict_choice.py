@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from study_rows import run, table_of, times_of
 
-from optid.studies.verdicts.averages import paired, time_ratios
-from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, choose, listed
+from optid.studies.verdicts.averages import paired_mean, time_ratios
+from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, choose, join_names
 from optid.studies.verdicts.verdict import conclude
 
 NAN = float("nan")
@@ -67,7 +67,7 @@ def test_who_is_faster_than_the_leader_of_the_common_problems_is_not_called_tied
     times[:10, 2] = times[52:100, 2] = 3.0
     times *= np.exp(0.05 * rng.normal(size=times.shape))
     choice = choose(times, ("a", "b", "c"))
-    assert paired(times[:, 1], times[:, 0]).high < 0.9
+    assert paired_mean(times[:, 1], times[:, 0]).high < 0.9
     assert (choice.kind, choice.first, choice.tied) == (FIRST, "b", ())
 
 
@@ -279,9 +279,9 @@ def test_numbers_of_one_thing_are_singular():
 
 
 def test_names_are_listed_as_in_a_sentence():
-    texts = [listed(list("abcdef"[:k])) for k in (0, 1, 2, 4, 6)]
+    texts = [join_names(list("abcdef"[:k])) for k in (0, 1, 2, 4, 6)]
     assert texts == ["", "a", "a and b", "a, b, c and d", "a, b, c and 3 more"]
-    assert listed(["free", "monotone, odd"]) == "\u201cfree\u201d and \u201cmonotone, odd\u201d"
+    assert join_names(["free", "monotone, odd"]) == "\u201cfree\u201d and \u201cmonotone, odd\u201d"
 
 
 def test_choose_alone_has_nothing_to_choose_from_nothing():

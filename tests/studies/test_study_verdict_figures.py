@@ -8,7 +8,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from optid.studies.verdicts.averages import paired, performance_profiles, shifted_geometric_mean, sign_test
+from optid.studies.verdicts.averages import paired_mean, performance_profiles, shifted_geometric_mean, sign_test
 
 NAN = float("nan")
 
@@ -61,19 +61,19 @@ def test_paired_ratio_against_scipy_and_its_reciprocal():
     a, b = np.exp(rng.normal(size=(2, 30)))
     a[3] = b[7] = NAN
     both = np.isfinite(a) & np.isfinite(b)
-    ratio, back = paired(a, b), paired(b, a)
+    ratio, back = paired_mean(a, b), paired_mean(b, a)
     interval = scipy.stats.ttest_rel(np.log(a[both]), np.log(b[both])).confidence_interval()
     assert (ratio.low, ratio.high) == pytest.approx(tuple(np.exp(interval)))
     assert ratio.value == pytest.approx(1 / back.value) and ratio.low == pytest.approx(1 / back.high)
     assert ratio.n == 28
-    assert paired(a[:1], b[:1]).high == np.inf and paired(a[3:4], b[3:4]).n == 0
+    assert paired_mean(a[:1], b[:1]).high == np.inf and paired_mean(a[3:4], b[3:4]).n == 0
 
 
 def test_the_interval_of_a_paired_difference_covers_as_often_as_it_says():
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(2000):
-        pair = paired(1.0 + rng.normal(size=8), np.zeros(8), ratio=False)
+        pair = paired_mean(1.0 + rng.normal(size=8), np.zeros(8), ratio=False)
         hits += pair.low <= 1.0 <= pair.high
     assert hits / 2000 == pytest.approx(0.95, abs=0.015)
 

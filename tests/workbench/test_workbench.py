@@ -28,7 +28,7 @@ from optid.examples import example
 from optid.models import HammersteinSS
 from optid.workbench import views
 from optid.workbench.bench import Bench, BenchSource
-from optid.workbench.request import ChosenConstraint, Request, suggested
+from optid.workbench.request import ChosenConstraint, Request, suggest_state
 from optid.workbench.server import PAGES, Server, serve
 
 ARGUMENTS = {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:10"}
@@ -38,7 +38,7 @@ def source(name="thruster", **options):
     chosen = example(name, **options)
     words = "".join(f", {key}={value!r}" for key, value in options.items())
     return BenchSource(chosen.data, f"optid.examples.example({name!r}{words}).data",
-                  suggested(chosen.data, chosen.suggestion))
+                  suggest_state(chosen.data, chosen.suggestion))
 
 
 @contextmanager
@@ -86,7 +86,7 @@ def test_a_page_begins_with_the_formulation_that_an_example_suggests():
 
 def test_strangers_are_refused():
     with served(source()) as server:
-        first, second = server.opened(), server.opened()
+        first, second = server.open_page(), server.open_page()
         host = {"Host": server.hosts[0]}
         opened = asked(server, "GET", server.address.partition(str(server.server_port))[2], **host)
         assert opened[0] == 200 and "Access-Control-Allow-Origin" not in opened[2]
@@ -108,13 +108,13 @@ def test_strangers_are_refused():
         assert [answer[0] for answer in refused] == [403] * len(refused)
         assert server.benches[first].fits and not server.benches[second].fits
         for _ in range(PAGES):
-            server.opened()
+            server.open_page()
         assert asked(server, body=body, **host, **known)[0] == 403  # the oldest page has given way
 
 
 def test_what_cannot_be_read_or_fitted_is_said():
     with served(source()) as server:
-        head = {"Host": server.hosts[0], "X-Optid-Page": server.opened()}
+        head = {"Host": server.hosts[0], "X-Optid-Page": server.open_page()}
         assert asked(server, body="[]", **head)[0] == 400
         assert asked(server, body="nonsense", **head)[0] == 400
         assert "cannot be read" in asked(server, body=json.dumps({"state": {"inputs": 3}}), **head)[1]
@@ -150,7 +150,7 @@ def test_the_script_repeats_the_numbers(constraints):
 
 def test_every_experiment_is_fitted_as_a_whole():
     record = two_by_two().select(outputs="level_a", inputs="valve <1>")
-    state = {**suggested(record, {}), "constraints": []}
+    state = {**suggest_state(record, {}), "constraints": []}
     bench = Bench(BenchSource(record, "record", state))
     shown = bench.answer("fit", {"state": state})
     assert "experiment 1 of 3" in shown["time"][0]["title"]
@@ -166,7 +166,7 @@ def test_every_experiment_is_fitted_as_a_whole():
 
 def test_curves_are_drawn_for_the_output_chosen():
     record = two_by_two()
-    state = {**suggested(record, {}), "formulation": "hammerstein_ss.sivid",
+    state = {**suggest_state(record, {}), "formulation": "hammerstein_ss.sivid",
              "arguments": {"nx": 2, "basis": "triangular:5"}, "constraints": []}
     state = constrained(state, ("through", {"u": 0.2, "y": 0.5, "channel": "valve <1>", "output": 'temp "b"'}, "point"))
     bench = Bench(BenchSource(record, "record", state))
@@ -187,7 +187,7 @@ def test_requests_are_computed_one_at_a_time(monkeypatch):
         running.pop()
         return {}
 
-    monkeypatch.setattr(views, "judged", slow)
+    monkeypatch.setattr(views, "verdict_view", slow)
     monkeypatch.setattr(views, "quick", slow)
     bench = Bench(of)
     with ThreadPoolExecutor(4) as pool:
@@ -260,7 +260,7 @@ def test_a_model_without_an_equilibrium_has_no_static_characteristic(monkeypatch
         raise StructureError("No equilibrium was found.")
 
     chosen = example("thruster")
-    state = {**suggested(chosen.data, {}), "formulation": "hammerstein_ss.asivid",
+    state = {**suggest_state(chosen.data, {}), "formulation": "hammerstein_ss.asivid",
              "arguments": {"nx": 2, "basis": "triangular:5"}}
     for tools in ({"static", "step"}, {"step"}):
         found = Bench(BenchSource(chosen.data, "record", state)).answer("fit", {"state": state})
@@ -271,7 +271,7 @@ def test_a_model_without_an_equilibrium_has_no_static_characteristic(monkeypatch
 def test_faults_may_be_taken_out():
     chosen = example("broken_thruster")
     model = optid.fit(example("thruster").data, "hammerstein_ss.asivid", nx=2, basis="triangular:10").model
-    bench = Bench(BenchSource(chosen.data, "", suggested(chosen.data, chosen.suggestion), model))
+    bench = Bench(BenchSource(chosen.data, "", suggest_state(chosen.data, chosen.suggestion), model))
     found, loss = bench.answer("diagnose", {"window": [0, 400]}), "actuator:current loss"
     assert found["word"].startswith("faulty") and found["answers"][0][0] == loss
     less = bench.answer("diagnose", {"window": [0, 400], "without": [loss]})
@@ -382,7 +382,7 @@ def test_the_page_offers_what_the_formulation_accepts(bench_page):
     for name, arguments, outputs, words in cases:
         arguments = {key: value for key, value in arguments.items() if name != "arx" or key != "basis"}
         data = record.select(outputs=list(record.outputs[:outputs]))
-        state = {**suggested(data, {}), "formulation": name, "arguments": arguments, "constraints": []}
+        state = {**suggest_state(data, {}), "formulation": name, "arguments": arguments, "constraints": []}
         browser.run(f"void (state = {json.dumps(state)})")
         bench = Bench(BenchSource(data, "", state))
         for word in words:
@@ -456,7 +456,7 @@ def test_experiment_and_output_are_chosen(tmp_path):
     if CHROMIUM is None:
         pytest.skip(NO_BROWSER)
     record = two_by_two()
-    start = {**suggested(record, {}), "formulation": "hammerstein_ss.sivid",
+    start = {**suggest_state(record, {}), "formulation": "hammerstein_ss.sivid",
              "arguments": {"nx": 2, "basis": "triangular:5"}}
     titles = "[...document.querySelectorAll('#plots figure h3')].map((e) => e.textContent)"
     with served(BenchSource(record, "", start)) as server, Browser(tmp_path) as browser:
@@ -481,9 +481,9 @@ def test_a_dated_record_shows_dates_and_samples_of_the_whole(tmp_path):
     if CHROMIUM is None:
         pytest.skip(NO_BROWSER)
     data = example("thruster").data
-    data = optid.Data(data.u, data.y, 60.0, "current", "thrust", start="2024-05-01T06:00").mapped(
+    data = optid.Data(data.u, data.y, 60.0, "current", "thrust", start="2024-05-01T06:00").map_signals(
         lambda u: u, lambda y: y, findings=("clock 't': in min, read as seconds",))
-    start = suggested(data, {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:4"})
+    start = suggest_state(data, {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:4"})
     with served(BenchSource(data, "data", {**start, "window": [100, 500]})) as server, Browser(tmp_path) as browser:
         goto(browser, server)
         assert browser.run("document.querySelector('main section').textContent").split("read")[0].endswith("in min, ")
@@ -526,7 +526,7 @@ def test_a_page_diagnoses_and_asks_what_if(tmp_path):
     if CHROMIUM is None:
         pytest.skip(NO_BROWSER)
     chosen = example("broken_thruster")
-    start = suggested(chosen.data, chosen.suggestion)
+    start = suggest_state(chosen.data, chosen.suggestion)
     start |= {"formulation": "hammerstein_ss.asivid", "arguments": {"nx": 2, "basis": "triangular:10"},
               "window": [0, 240], "constraints": []}
     with served(BenchSource(chosen.data, "", start)) as server, Browser(tmp_path) as browser:

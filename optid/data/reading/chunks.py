@@ -112,7 +112,7 @@ class Survey:
     last: End | None = None  # where it ends
 
 
-def surveyed(part: Any, chunks: Iterable[Chunk]) -> Survey:
+def survey_part(part: Any, chunks: Iterable[Chunk]) -> Survey:
     """Survey one part."""
     count, first, last = 0, None, None
     lo = hi = np.asarray(np.nan)
@@ -126,7 +126,7 @@ def surveyed(part: Any, chunks: Iterable[Chunk]) -> Survey:
     return Survey({part.experiment: count}, lo, hi, first, last)
 
 
-def joined(channels: Channels, surveys: Sequence[Survey]) -> Survey:
+def join_surveys(channels: Channels, surveys: Sequence[Survey]) -> Survey:
     """Join the surveys of neighbours; `DataError` if the clock does not continue from one to the next."""
     lengths: Counter[int] = Counter()
     lo = hi = np.asarray(np.nan)

@@ -101,7 +101,7 @@ class TimeColumn:
         values = np.ravel(block[self.columns[0]])
         if self.kind == "digits":
             width = len(datetime(2024, 1, 1).strftime(self.forms[0]))
-            stamps = dates.parse(dates.spelled(values, width), self.forms[0], where)[0]
+            stamps = dates.parse(dates.format_digits(values, width), self.forms[0], where)[0]
             return self._in_utc(stamps, where) if dates.has_day(self.forms[0]) else stamps.view("m8[ns]")
         if self.kind == "ready":
             stamps = dates.in_nanoseconds(values, where)

@@ -107,7 +107,8 @@ def quality_columns(known: Sequence[str], signals: Iterable[str]) -> dict[str, s
     return found
 
 
-def guarded(quality: Mapping[str, str], known: Sequence[str], signals: Sequence[str], label: str) -> dict[str, str]:
+def check_quality_columns(quality: Mapping[str, str], known: Sequence[str], signals: Sequence[str],
+                          label: str) -> dict[str, str]:
     """Return {column of quality: column of samples, "" for all} for those that the user names (`DataError`)."""
     found, named = {}, quality_columns(known, signals)
     for column in quality:

@@ -21,7 +21,7 @@ import numpy as np
 from optid.data.reading.columns import cell_error, to_numbers
 from optid.data.reading.format import Format
 from optid.data.reading.layout import BLANKS, TextLayout, find_layout
-from optid.data.reading.textfile import clean, opened
+from optid.data.reading.textfile import clean, open_text
 from optid.errors import DataError
 
 NULLS = ["NA", "N/A", "null", "NULL", "None", "nan", "NaN", "NAN"]
@@ -84,7 +84,7 @@ class CsvFile:
 
     def _blocks(self, wanted: Sequence[str], texts: Mapping[str, str]) -> Iterator[Columns]:
         done, mark, how = 0, self.layout.delimiter, self._how
-        with opened(self.path, how.encoding) as file:
+        with open_text(self.path, how.encoding) as file:
             blocks = file.blocks(self.layout.offset, 2 * len(self.names) + SPARE, mark.encode())
             cleaned = (clean(block, how.comment, how.delimiter == BLANKS) for block in blocks)
             if self.path.stat().st_size > SMALL and mark.isascii() and how.thousands is None:

@@ -222,7 +222,7 @@ def instant(text: str) -> float | None:
     return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
 
 
-def spelled(values: np.ndarray, width: int) -> Any:
+def format_digits(values: np.ndarray, width: int) -> Any:
     """Return numbers (N,) as a series of texts with at least so many digits, NaN as missing."""
     import polars as pl
 

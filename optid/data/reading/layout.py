@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from optid.data.reading import dates
 from optid.data.reading.clock import clock_hints
 from optid.data.reading.format import Format, call, is_number
-from optid.data.reading.textfile import opened
+from optid.data.reading.textfile import open_text
 from optid.errors import DataError
 
 BLANKS = " "
@@ -69,7 +69,7 @@ def find_layout(path: Path, how: Format) -> TextLayout:
         DataError: no rows, not text, preamble or comments before the header, names that do not fit the rows, or two
             columns of one name.
     """
-    with opened(path, how.encoding) as file:
+    with open_text(path, how.encoding) as file:
         text, encoding = file.head()
         how = how if how.encoding else replace(how, encoding=encoding)
         needed = {} if file.trusted else {"encoding": encoding}
@@ -151,7 +151,7 @@ def _rows(lines: Sequence[str], first: int, start: int, how: Format, where: str)
     rows: list[_Row] = []
     taken = [first, start]  # number of the last line, characters before the next
 
-    def given() -> Any:
+    def read_named() -> Any:
         for line in lines:
             taken[0], taken[1] = taken[0] + 1, taken[1] + len(line)
             if not _is_comment(line, how):
@@ -159,7 +159,8 @@ def _rows(lines: Sequence[str], first: int, start: int, how: Format, where: str)
 
     blanks = how.delimiter == BLANKS
     try:
-        for cells in (map(str.split, given()) if blanks else csv.reader(given(), delimiter=how.delimiter or ",")):
+        for cells in (map(str.split, read_named()) if blanks else csv.reader(read_named(),
+                                                                             delimiter=how.delimiter or ",")):
             if any(cells) or len(rows) > MOST_TEXT_ROWS or any(any(map(_is_value, row.cells)) for row in rows):
                 rows.append(_Row(cells, *taken))
             elif rows:  # a blank line after the header

@@ -12,7 +12,7 @@ from optid.errors import DataError
 MOST_TAGS = 1000
 
 
-def explained(error: DataError, table: RawTable, inputs: Any, outputs: Any) -> DataError:
+def explain_missing_column(error: DataError, table: RawTable, inputs: Any, outputs: Any) -> DataError:
     """Return the error about a missing column, or the one that the table is long where its cells name the channels."""
     texts = [name for name in table.names if name and name not in table.dates and not is_time_name(name)]
     if not texts:

@@ -101,11 +101,11 @@ def _numbers(shape: tuple[int, ...], load: Callable[[], np.ndarray]) -> Node:
         return Refused(f"has {len(shape)} dimensions ({_times(shape)}); it must be samples by channels")
     flat = shape if len(long) > 1 else (max(shape, default=1),)
 
-    def loaded() -> np.ndarray:
+    def load_array() -> np.ndarray:
         array = load().reshape(flat)
         return array.astype(np.float64) if array.dtype.kind == "b" else array
 
-    return Numbers(flat, loaded)
+    return Numbers(flat, load_array)
 
 
 def _elements(brackets: str, size: int, items: Iterator[Node]) -> Node:

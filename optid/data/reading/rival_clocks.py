@@ -7,7 +7,7 @@ import numpy as np
 
 from optid.data.reading.clock import NoStamps, TimeColumn, over_midnight, recognise, seconds
 from optid.data.reading.sources import RawTable, Source
-from optid.data.reading.uniform import COARSE, repeated
+from optid.data.reading.uniform import COARSE, share_of_repeats
 from optid.errors import DataError
 
 AGREEMENT = 1e-3  # share of the span by which two clocks may differ, beyond one step of the coarser one
@@ -49,7 +49,7 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: RawTable | Sou
                 f"{table.label}: two clocks disagree: {_told(clock, stamps)}, {_told(other, rival)}. Choose one: "
                 f"time={clock.columns[0]!r} or time={other.columns[0]!r}.")
     if len(found) > 1:  # of clocks that agree the one with the finer stamps, dated if both are
-        clock, stamps = min(found, key=lambda one: (repeated(one[1]), one[1].dtype.kind != "M"))
+        clock, stamps = min(found, key=lambda one: (share_of_repeats(one[1]), one[1].dtype.kind != "M"))
     if table.how.time_zone is not None and clock.kind == "numbers" and clock.scale != 86400.0:
         raise DataError(f"{table.label}: time_zone={table.how.time_zone!r} is for local dates; the clock "
                         f"{clock.columns[0]!r} holds numbers.")
@@ -89,7 +89,7 @@ def _agree(one: np.ndarray, other: np.ndarray) -> bool:
 def _resolution(t: np.ndarray) -> float:
     """Return the resolution of stamps that rows share, or a hundredth of the usual step."""
     steps = np.abs(np.diff(t))
-    return float(np.max(steps)) if repeated(t) > COARSE else 0.01 * float(np.median(steps))
+    return float(np.max(steps)) if share_of_repeats(t) > COARSE else 0.01 * float(np.median(steps))
 
 
 def _told(clock: TimeColumn, stamps: np.ndarray) -> str:

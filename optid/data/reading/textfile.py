@@ -99,7 +99,7 @@ class TextFile:
 
 
 @contextmanager
-def opened(path: Path, encoding: str | None) -> Iterator[TextFile]:
+def open_text(path: Path, encoding: str | None) -> Iterator[TextFile]:
     """Open a text file; text that is not of its encoding becomes a `DataError`."""
     with open(path, "rb", buffering=0) as file:
         try:

@@ -110,11 +110,11 @@ def regular(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, dt: float | None, 
     _check_whole(stamps, label, 0)
     if how.resample is not None:
         return _resampled(stamps, u, y, how, label)
-    if dt is not None and repeated(stamps) > COARSE:
+    if dt is not None and share_of_repeats(stamps) > COARSE:
         return [Piece(stamps[0], u, y)], dt, [_check_spread(stamps, dt, label)]
     if how.gaps is None or stamps.size < 2:
         said = []
-        if repeated(stamps) > COARSE and _are_copies(stamps, u, y):
+        if share_of_repeats(stamps) > COARSE and _are_copies(stamps, u, y):
             raise DataError(f"{label}: rows that share a time stamp are equal: pass gaps='missing' to count each once, "
                             "or dt= where they are samples of their own.")
         if stamps.size > 1 and stamps[1] < stamps[0] and (seconds(np.diff(stamps)) < 0).all():
@@ -130,7 +130,7 @@ def regular(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, dt: float | None, 
     return _without_gaps(stamps, u, y, how, label)
 
 
-def repeated(stamps: np.ndarray) -> float:
+def share_of_repeats(stamps: np.ndarray) -> float:
     """Return the share of stamps that are equal to the one before."""
     return float(np.mean(stamps[1:] == stamps[:-1])) if stamps.size > 1 else 0.0
 

@@ -178,7 +178,7 @@ def bounded_window(model: "HammersteinSS", data: Data, bounds: Any = SIGMAS) -> 
         raise DataError(f"Input {model.inputs[c]!r} is missing at sample {k}: set membership requires every input.")
     process, output = _bounds(model, bounds)
     present = np.asarray(~np.isnan(part.y))
-    f, y = model.expanded(part.u), np.where(present, part.y, 0.0)
+    f, y = model.expand_inputs(part.u), np.where(present, part.y, 0.0)
     drive = f @ model.B.T + model.offset_x + y @ model.L.T
     fed_back = np.any(model.L != 0, axis=0)
     for i, (function, o) in enumerate(zip(model.feedback, model.output_of)):

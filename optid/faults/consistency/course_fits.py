@@ -77,7 +77,7 @@ class CourseFits:
         sizes = np.abs(np.ravel(solution.values["changes"])) * lengths
         kept = np.flatnonzero(sizes > 1e-5 * max(float(sizes.max()), 1e-3 * float(np.linalg.norm(problem.r))))
         if kept.size:
-            kept = problem.pruned(design, problem.moved(design, problem.pruned(design, kept)))
+            kept = problem.prune(design, problem.move_changes(design, problem.prune(design, kept)))
         key = (prior, *kept.tolist())
         if key in self._seen:
             return None

@@ -91,13 +91,13 @@ class NoiseSearch:
     start: Array = field(repr=False)  # (N l, n') orthonormal responses to the initial state, projected out of windows
     count: int  # readings of a window
 
-    def cleaned(self, windows: Array) -> Array:
+    def without_initial_state(self, windows: Array) -> Array:
         """Return windows (M, N l) without their responses to the initial state."""
         return windows - (windows @ self.start) @ self.start.T
 
     def gains(self, windows: Array) -> tuple[Array, Array]:
         """Return variances (M, C) and gains in log-likelihood (M, C) of windows (M, N l)."""
-        clean = self.cleaned(windows)
+        clean = self.without_initial_state(windows)
         found = [place.maximise(clean) for place in self.places]
         return np.stack([rho for rho, _ in found], axis=1), np.stack([gain for _, gain in found], axis=1)
 
@@ -238,7 +238,7 @@ def noise_test(
     levels = prepared.healthy(draws, 0) if healthy is None else healthy
     window = whitened.r.reshape(1, -1)
     rho, gains = prepared.gains(window)
-    clean = prepared.cleaned(window)[0]
+    clean = prepared.without_initial_state(window)[0]
     changes = [
         NoiseChange(place.label, place.name, float(variance), place.interval(clean, float(variance), float(gain)),
                     float(gain), float(np.sqrt(1 + variance / place.present)) if place.present > 0 else float("nan"))

@@ -110,7 +110,7 @@ class CourseProblem:
         """(N, N) what gives the steps of a course, the first from zero."""
         return np.eye(self.count) - np.eye(self.count, k=-1)
 
-    def refitted(self, columns: Array) -> tuple[Array, float]:
+    def refit(self, columns: Array) -> tuple[Array, float]:
         """Return the least-squares coefficients of columns (N l, K) and the residual energy."""
         solved = np.linalg.lstsq(columns, self.r, rcond=1e-10)[0]
         rest = self.r - columns @ solved
@@ -120,13 +120,13 @@ class CourseProblem:
         """Return the Bayesian information criterion for innovations of known variance."""
         return energy + freedom * float(np.log(self.readings))
 
-    def pruned(self, columns: Array, support: np.ndarray) -> np.ndarray:
+    def prune(self, columns: Array, support: np.ndarray) -> np.ndarray:
         """Return the changes left of a support by backward elimination as long as the criterion falls.
 
         The columns (N l, N) are those of all changes.
         """
         kept = list(support)
-        best = self.criterion(self.refitted(columns[:, kept])[1], EACH * len(kept)) if kept else np.inf
+        best = self.criterion(self.refit(columns[:, kept])[1], EACH * len(kept)) if kept else np.inf
         while len(kept) > 1:
             q, triangle = np.linalg.qr(columns[:, kept])
             try:
@@ -138,14 +138,14 @@ class CourseProblem:
             loss = solved**2 / np.sum(inverse**2, axis=1)  # increase of the energy without each of them
             weakest = int(np.argmin(loss))
             trial = kept[:weakest] + kept[weakest + 1 :]
-            value = self.criterion(self.refitted(columns[:, trial])[1], EACH * len(trial))
+            value = self.criterion(self.refit(columns[:, trial])[1], EACH * len(trial))
             if value > best:
                 break
             kept, best = trial, value
         return np.array(kept, dtype=int)
 
-    def moved(self, columns: Array, kept: np.ndarray) -> np.ndarray:
-        """Move every change to its best sample beside the others, until none moves; arguments as of `pruned`."""
+    def move_changes(self, columns: Array, kept: np.ndarray) -> np.ndarray:
+        """Move every change to its best sample beside the others, until none moves; arguments as of `prune`."""
         sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         unit = columns / sizes
 

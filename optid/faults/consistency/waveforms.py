@@ -162,12 +162,12 @@ def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened,
     into_state[at + onset, :, at], into_output[at + onset, :, at] = state[onset:], output[onset:]
     response = whitened.predictor.respond(
         into_state.reshape(count, found.model.nx, -1), into_output.reshape(count, found.model.l, -1), whitened.present)
-    return np.asarray(whitened.seen(response).reshape(whitened.r.size, -1))
+    return np.asarray(whitened.whiten_signature(response).reshape(whitened.r.size, -1))
 
 
 def start_matrix(whitened: Whitened) -> Array:
     """Return the signatures of the initial state, (N l, n)."""
-    return whitened.seen(whitened.predictor.jumps(0, whitened.present)).reshape(whitened.r.size, -1)
+    return whitened.whiten_signature(whitened.predictor.jumps(0, whitened.present)).reshape(whitened.r.size, -1)
 
 
 def _fitted(name: str, matrix: Array, start: Array, whitened: Whitened, probability: float, d: int) -> Consistency:

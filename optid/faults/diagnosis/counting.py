@@ -71,7 +71,7 @@ def trace_error(scan: "Scan", uncertainty: ModelUncertainty, candidate: Candidat
     columns = np.empty((*white.r.shape, len(pairs)))
     for j, (plus, minus, factor) in enumerate(pairs):
         columns[:, :, j] = (trace(plus) - trace(minus))[:, :, 0] * factor
-    flat = white.seen(columns).reshape(white.r.size, -1)
+    flat = white.whiten_signature(columns).reshape(white.r.size, -1)
     U, s, _ = np.linalg.svd(flat, full_matrices=False)
     there = s > SMALL
     return Nuisance(U[:, there], s[there])

@@ -24,7 +24,7 @@ from optid.faults.diagnosis.records import (
     without_lost_readings,
 )
 from optid.faults.nuisance import uncertain_start
-from optid.faults.ranges import extrapolated, outside, usable_samples
+from optid.faults.ranges import input_range_notes, outside, usable_samples
 from optid.faults.screening import check_channels
 from optid.faults.search.calibration import Thresholds
 from optid.faults.signatures import Dictionary, dictionary
@@ -118,7 +118,7 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
     stuck = lost_sensors(lines, found, 2 * model.nx)
     first = search_record(record, part, found, asked, noise)
     notes = [remark, cut, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u)),
-             *extrapolated(model, part.u), *first.extrapolated]
+             *input_range_notes(model, part.u), *first.extrapolated]
     seen, ranking, alarm = explain_record(first)
     notes.append(ranking.note)
     fits = ranking.fits if not found.unknown or ranking.explains else ()

@@ -14,7 +14,7 @@ from optid.faults.diagnosis.counting import with_model_uncertainty
 from optid.faults.diagnosis.leftover import UNFIT, further_fault, remainder_test
 from optid.faults.diagnosis.posterior import Explanation, several, single, smallest_set
 from optid.faults.diagnosis.record_search import RecordSearch
-from optid.faults.programmes import solved
+from optid.faults.programmes import solve_registered
 from optid.faults.search.scanning import scan
 from optid.faults.search.subsets import SubsetSearch, best_subsets
 
@@ -222,7 +222,7 @@ def _by_programme(seen: RecordSearch) -> Ranking:
             f"method={asked.method!r} requires a candidate with a signature: add kind 'bias', or use method='exact'."
         )
     try:
-        result: SparseResult = solved("fault.signature", search, limits, solver=asked.solver)
+        result: SparseResult = solve_registered("fault.signature", search, limits, solver=asked.solver)
     except SolverFailed:
         return Ranking(note="The solver found no point.")
     if asked.method == "sparse+polish":
@@ -251,7 +251,8 @@ def _by_bounds(seen: RecordSearch) -> tuple[Ranking, bool]:
     stop = min(start + STRETCH, count)
     record, part = seen.record, seen.part
     stretch = Data(part.u, part.y, record.dt, record.inputs, record.outputs, start=part.start).window(start, stop)
-    found = solved("fault.membership", seen.dictionary.model, stretch, faults=seen.dictionary, candidates=False,
+    found = solve_registered("fault.membership", seen.dictionary.model, stretch, faults=seen.dictionary,
+                             candidates=False,
                    solver=seen.asked.solver)
     where = f"samples {start} to {stop - 1}"
     if not found.impossible:

@@ -109,7 +109,7 @@ class RecordSearch:
     @cached_property
     def extrapolated(self) -> list[str]:
         """The outputs that leave the range over which an uncertain model was identified, in words."""
-        return self.noise["uncertainty"].extrapolated(self.part.y)
+        return self.noise["uncertainty"].output_range_notes(self.part.y)
 
     @cached_property
     def p_value(self) -> float:
@@ -220,7 +220,7 @@ def untestable(found: Scan) -> dict[str, str]:
         if candidate.columns and found.u is not None:
             white = found.whitened
             into_state, into_output = found.dictionary.additions(candidate.widened, len(white.r), 0, found.u)
-            trace = white.seen(white.predictor.respond(into_state, into_output, white.present))
+            trace = white.whiten_signature(white.predictor.respond(into_state, into_output, white.present))
             flat = trace.reshape(-1, trace.shape[2])
             beside = flat[:, 1:]
             rest = flat[:, 0] - beside @ np.linalg.lstsq(beside, flat[:, 0], rcond=1e-9)[0]

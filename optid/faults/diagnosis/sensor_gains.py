@@ -213,13 +213,13 @@ class SensorGain:
         filters = [self._filter(float(share)) for share in different]
         innovations = self._innovations(onsets, [filters[i] for i in which], shares)
         result = np.empty_like(innovations)
-        before = steady.whitened(np.where(present, self.white.innovations, 0.0), present)
+        before = steady.whiten(np.where(present, self.white.innovations, 0.0), present)
         costs = np.zeros(len(shares))
         log_healthy = _scales(steady, present)
         tails = [np.concatenate([np.cumsum((_scales(f, present) - log_healthy)[::-1])[::-1], [0.0]]) for f in filters]
         for j, onset in enumerate(onsets):
             result[j, :onset] = before[:onset]
-            result[j, onset:] = filters[which[j]].whitened(innovations[j, onset:], present[onset:])
+            result[j, onset:] = filters[which[j]].whiten(innovations[j, onset:], present[onset:])
             costs[j] = tails[which[j]][onset]
         nuisance = self.nuisance or self.white.nuisance
         if nuisance is not None:
@@ -232,7 +232,7 @@ class SensorGain:
         gain, rows = np.stack([f.K for f in filters]), np.stack([f.C for f in filters])
         left = np.ones((len(shares), model.l))
         left[:, self.o] = 1 - shares
-        driven = model.expanded(self.part.u)
+        driven = model.expand_inputs(self.part.u)
         direct, into = driven @ model.D.T + model.offset_y, driven @ model.B.T + model.offset_x
         assert self.white.states is not None
         x, innovations = np.zeros((len(shares), model.nx)), np.zeros((len(shares), *self.part.y.shape))
@@ -283,8 +283,8 @@ class SensorGain:
             drive = np.zeros((len(e), model.nx, e.shape[2]))
             drive[1:] = steady.K @ e[:-1]
             filtered = replace(own, C=model.C, K=own.K * left).respond(drive, e, present[after])
-            return np.concatenate([steady.whitened(changes[:onset], present[:onset]),
-                                   own.whitened(left[:, None] * filtered, present[after])])
+            return np.concatenate([steady.whiten(changes[:onset], present[:onset]),
+                                   own.whiten(left[:, None] * filtered, present[after])])
 
         model = self.found.model
         assert self.white.states is not None

@@ -55,7 +55,7 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
     for part, x0 in zip(raw.experiments, as_list(given)):
         here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
         there = ~np.isnan(here.y)
-        by_parameter, by_start = (known.predictor.flattened(effect, there) for effect in
+        by_parameter, by_start = (known.predictor.whitened_columns(effect, there) for effect in
                                   known.sensitivities(here, x0, there))
         by_parameter -= by_start @ np.linalg.lstsq(by_start, by_parameter, rcond=None)[0]
         raw_effect = np.linalg.pinv(known.predictor.root) @ by_parameter.reshape(*here.y.shape, -1)
@@ -66,7 +66,7 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
             raw_effect = shape.respond(np.zeros((len(here.y), len(shape.A), raw_effect.shape[2])), raw_effect)
         effect = raw_effect
         effects.append(steady.root @ effect)
-        inputs.append(known.model.expanded(here.u))
+        inputs.append(known.model.expand_inputs(here.u))
     effect = np.concatenate(effects)
     if not known.deviation:
         effect = np.concatenate([effect, np.zeros((*effect.shape[:2], 1))], axis=2)

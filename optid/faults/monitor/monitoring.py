@@ -29,7 +29,7 @@ from optid.faults.nuisance import ModelUncertainty, model_uncertainty, uncertain
 from optid.faults.signatures import Dictionary, dictionary
 from optid.identify.recursive.state import as_block
 from optid.models.experiments import state_like
-from optid.models.feedback_tables import tabulated
+from optid.models.feedback_tables import tabulate
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
@@ -173,7 +173,7 @@ class Monitor:
                                    model.outputs, np.ones(len(chosen), dtype=bool), [], found.candidates)
         self.samples = 0
         self.recent = self.decisions.recent = None if known is None else Recent(known, window)
-        self._functions = tabulated(model.nonlinearities)
+        self._functions = tabulate(model.nonlinearities)
         self._input_of, self._output_of = (np.array(of, dtype=np.int64) for of in (model.input_of, model.output_of))
 
     def _use(self, found: Calibration) -> None:
@@ -222,13 +222,13 @@ class Monitor:
             if inputs.shape[1] != model.m or not np.isfinite(inputs).all() or len(inputs) < self.window:
                 raise DataError(
                     f"u has shape {np.shape(u)}; give {self.window} samples or more of {model.m} inputs.")
-            return model.expanded(inputs)
+            return model.expand_inputs(inputs)
         spans = [(-1.0, 1.0)] * model.m
         for c, nonlinearity in zip(model.input_of, model.nonlinearities):
             spans[c] = nonlinearity.basis.interval or spans[c]
         low, high = np.array(spans).T
         drawn = np.random.default_rng(self.seed).uniform(low, high, (INPUTS // HOLD, model.m))
-        return model.expanded(np.repeat(drawn, HOLD, axis=0))
+        return model.expand_inputs(np.repeat(drawn, HOLD, axis=0))
 
     # -- samples -------------------------------------------------------------------------------------------------
 
@@ -414,7 +414,7 @@ class Monitor:
             if bad >= 0:
                 raise DataError(f"sample {self.samples + bad}: an input is outside the interval of its basis.")
             return f
-        return np.vstack([model.expanded(u[k : k + 1]) for k in range(len(u))])  # the same digits for any block
+        return np.vstack([model.expand_inputs(u[k : k + 1]) for k in range(len(u))])  # the same digits for any block
 
     def _fed(self, y: Array) -> Array:
         fed = np.empty((len(y), len(self._output_of)))

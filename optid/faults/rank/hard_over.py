@@ -96,7 +96,7 @@ class WindowVerdict:
         """Those of the sensors, then those of the actuators."""
         return (*self.rows, *self.columns)
 
-    def changed(self, nominal: int) -> bool:
+    def is_changed(self, nominal: int) -> bool:
         """Whether the order is outside the range that a healthy plant of the nominal order may show."""
         return self.order is not None and not min(self.least_order, nominal) <= self.order <= nominal
 
@@ -128,7 +128,7 @@ class HardOver:
     @property
     def alarm(self) -> WindowVerdict | None:
         """The first window with a dead row or column, or the second in a row of an order no healthy plant shows."""
-        changed = [verdict.experiment if verdict.changed(self.nominal_order) else None for verdict in self.windows]
+        changed = [verdict.experiment if verdict.is_changed(self.nominal_order) else None for verdict in self.windows]
         return next((verdict for verdict, now, before in zip(self.windows, changed, [None, *changed])
                      if verdict.dead or now is not None and now == before), None)
 
@@ -276,7 +276,8 @@ class _Tests:
         self.healthy = {test.name: test.coefficients for test in (*rows, *columns)}
 
     def signals(self, data: Data) -> list[Array]:
-        return [np.hstack([e.u if self.model is None else self.model.expanded(e.u), e.y]) for e in data.experiments]
+        return [np.hstack([e.u if self.model is None else self.model.expand_inputs(e.u),
+                           e.y]) for e in data.experiments]
 
     def judge(self, record: Array, place: tuple[int, int, int]) -> WindowVerdict:
         try:

@@ -105,9 +105,9 @@ class Allocation:
         """
         from optid.registry import fault_formulation
 
-        problem, r = self.problem, self.checked(reference)
+        problem, r = self.problem, self.check_reference(reference)
         if not self.moving:
-            return self._target(r, self.middle, self.model.expanded(self.middle[None, :])[0], None)
+            return self._target(r, self.middle, self.model.expand_inputs(self.middle[None, :])[0], None)
         if self.route == "qp":
             posed = fault_formulation("allocation.target")(problem, reference=r)
             solution = self._solved(posed, posed.start)
@@ -116,7 +116,7 @@ class Allocation:
         posed, third = fault_formulation("allocation.resting")(problem, reference=r), (self.high - self.low) / 3
         found, failure = [], None
         for u in (self.middle, self.middle + third, self.middle - third):
-            v = self.model.expanded(u[None, :])[0]
+            v = self.model.expand_inputs(u[None, :])[0]
             x, y = self._rests(u, v)[0]
             try:
                 solution = self._solved(posed, {"u": u, "v": self.columns(u, y), "x": x, "y": y})
@@ -124,7 +124,7 @@ class Allocation:
                 failure = error
                 continue
             u = np.clip(solution.values["u"], self.low, self.high)
-            found.append(self._target(r, u, self.model.expanded(u[None, :])[0], solution))
+            found.append(self._target(r, u, self.model.expand_inputs(u[None, :])[0], solution))
         if failure is not None and not found:
             raise failure
         return min(found, key=lambda one: one.distance)
@@ -163,7 +163,7 @@ class Allocation:
         """The reason why nothing can be controlled, where no actuator has an effect; "" otherwise."""
         return "" if self.moving else f"nothing acts on {', '.join(self.model.outputs)}"
 
-    def checked(self, reference: ArrayLike) -> Array:
+    def check_reference(self, reference: ArrayLike) -> Array:
         """Return a reference as an array (l,); refuse another size, and numbers that are not finite."""
         r = np.atleast_1d(np.asarray(reference, dtype=float))
         if r.shape != (self.model.l,) or not np.all(np.isfinite(r)):
@@ -196,7 +196,7 @@ class Allocation:
     def columns(self, u: Array, y: Array) -> Array:
         """Return the columns [f(u); g(y)] of one sample."""
         fed = [float(g(y[o])) for g, o in self.problem.feedback]
-        return np.append(self.model.expanded(u[None, :])[0], fed)
+        return np.append(self.model.expand_inputs(u[None, :])[0], fed)
 
     def corners(self) -> Array:
         """Return the corners (k, 2), in order, of the set of attainable steady outputs, without a shared limit.

@@ -115,7 +115,7 @@ def probe_input(
         return np.repeat(levels, hold, axis=0)[:length]
 
     def separation(levels: Array) -> tuple[float, int]:
-        v = plant.expanded(course(levels)).ravel()
+        v = plant.expand_inputs(course(levels)).ravel()
         found = [float(np.linalg.norm(M @ v + d)) for M, d in differences]
         return min(found), int(np.argmin(found))
 
@@ -137,7 +137,7 @@ def probe_input(
                 break
         if value > reached:
             best, reached = levels, value
-    points = plant.expanded(np.linspace(least, most, 201))
+    points = plant.expand_inputs(np.linspace(least, most, 201))
     size = float(np.sqrt(length * np.sum(np.max(points**2, axis=0))))  # largest norm of f(u) over the probe
     bound = min(float(np.linalg.norm(M, 2)) * size + float(np.linalg.norm(d)) for M, d in differences)
     i, j = pairs[separation(best)[1]]
@@ -149,7 +149,7 @@ def _responses(model: "HammersteinSS", members: Sequence[Damage], length: int) -
     steady, (n, r), l = predictor(model), model.B.shape, model.l  # noqa: E741
     x, y = np.zeros((length, n, r)), np.zeros((length, l, r))
     x[1], y[0] = model.B, model.D
-    one, blocks = steady.whitened(steady.respond(x, y)), np.zeros((length, l, length, r))
+    one, blocks = steady.whiten(steady.respond(x, y)), np.zeros((length, l, length, r))
     for k in range(length):
         blocks[k:, :, k, :] = one[: length - k]
     found = []
@@ -157,7 +157,7 @@ def _responses(model: "HammersteinSS", members: Sequence[Damage], length: int) -
         x = np.tile(model.B @ member.constants + member.added, (length, 1))[:, :, None]
         x[0] = 0.0
         y = np.tile(model.D @ member.constants, (length, 1))[:, :, None]
-        d = steady.whitened(steady.respond(x, y)).ravel()
+        d = steady.whiten(steady.respond(x, y)).ravel()
         found.append(((blocks * (member.gains - 1)).reshape(length * l, length * r), d))
     return found
 
@@ -205,7 +205,7 @@ def _waiting(model: "HammersteinSS", members: Sequence[Damage], u: Array | None)
     inputs = np.zeros((0, model.m)) if u is None else u[-RECENT:]
     if len(inputs) < 2 or np.isnan(inputs).any():
         return float("inf")
-    v = model.expanded(inputs).ravel()
+    v = model.expand_inputs(inputs).ravel()
     traces = [(M @ v + d).reshape(len(inputs), -1) for M, d in _responses(model, members, len(inputs))]
     rate = min(float(np.mean(np.sum((one - other)[len(inputs) // 3 :] ** 2, axis=1)))
                for one, other in combinations(traces, 2))

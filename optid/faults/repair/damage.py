@@ -58,7 +58,7 @@ class Damage:
         steady = kalman_gain(model.A, model.C, Q, R, model.noise.S)
         return replace(model, K=steady.K, noise=replace(model.noise, Q=Q, R=R, innovation=steady.innovation))
 
-    def believed(self, model: "HammersteinSS") -> "HammersteinSS":
+    def nominal_model(self, model: "HammersteinSS") -> "HammersteinSS":
         """Return the model with the gains and constants of the diagnosis, without a refit."""
         functions = list(model.nonlinearities)
         constants = np.array(self.constants)
@@ -90,7 +90,7 @@ def _may_be_none(fault: "Estimate") -> bool:
     return lasting and intervals.size > 0 and bool(np.all((intervals[:, 0] <= 0) & (intervals[:, 1] >= 0)))
 
 
-def merged(model: "HammersteinSS", broken: list[Damage]) -> list[Damage]:
+def merge_equivalent(model: "HammersteinSS", broken: list[Damage]) -> list[Damage]:
     """Merge explanations that break the same parts, as a loss and a stuck actuator do, which are refitted alike.
 
     So are an actuator and a disturbance of the states where it enters. The most probable one is kept, with the sum of

@@ -15,7 +15,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.bases import Linear
 from optid.data.record import Data
-from optid.data.stretches import interpolated
+from optid.data.stretches import interpolate_missing
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.faults.repair.curves import Curve, curve_of
 from optid.faults.repair.damage import Damage
@@ -161,7 +161,7 @@ class Refitting:
         """Names of the unknowns with a healthy prior."""
         return (*MATRICES, *(f"mu {i + 1}" for i in self.others)) if self.whole else ()
 
-    def believed(self) -> tuple[Array, Array]:
+    def prior_rows(self) -> tuple[Array, Array]:
         """Return the prior as rows of a least-squares problem in [z; shares lost], and their target."""
         width = self.start.size + len(self.curves)
         rows, wanted = [np.zeros((0, width))], [np.zeros(0)]
@@ -186,8 +186,8 @@ class Refitting:
 
         Every share lost is 0.5 +- 0.5. Exact where the unknowns enter linearly.
         """
-        r, s = self.linearised(self.start)
-        rows, wanted = self.believed()
+        r, s = self.linearise(self.start)
+        rows, wanted = self.prior_rows()
         shares = np.eye(rows.shape[1])[self.start.size :] / 0.5
         rows, wanted = np.vstack([rows, shares]), np.concatenate([wanted, np.ones(len(shares))])
         full, target = np.pad(s, ((0, 0), (0, len(self.curves)))), s @ self.start - r
@@ -212,7 +212,7 @@ class Refitting:
 
         Bounds are not part of it.
         """
-        rows, _ = self.believed()
+        rows, _ = self.prior_rows()
         rows = np.vstack([rows, np.pad(sensitivities, ((0, 0), (0, len(self.curves))))])
         free = np.flatnonzero(np.append(np.logical_not(self.held), np.ones(len(self.curves), dtype=bool)))
         found = np.zeros((rows.shape[1],) * 2)
@@ -233,7 +233,7 @@ class Refitting:
         return replace(self.model, nonlinearities=tuple(functions), offset_x=self.model.offset_x + B @ constants,
                        offset_y=self.model.offset_y + D @ constants, gauge="none", **changes)
 
-    def linearised(self, theta: Array) -> tuple[Array, Array]:
+    def linearise(self, theta: Array) -> tuple[Array, Array]:
         """Return the whitened innovations (M,) at a point and their sensitivities (M, q), those present."""
         parts = [self._window(theta, number) for number in range(len(self.windows))]
         return np.concatenate([r for r, _ in parts]), np.vstack([s for _, s in parts])
@@ -260,14 +260,14 @@ class Refitting:
         if "x0" in self.slices:
             first = self.slices["x0"].start + number * n
             into_state[0, :, first : first + n] = np.eye(n)
-        response: Any = steady.whitened(steady.respond(into_state, into_output, shown), shown)
-        white: Any = steady.whitened(innovations, shown)
+        response: Any = steady.whiten(steady.respond(into_state, into_output, shown), shown)
+        white: Any = steady.whiten(innovations, shown)
         return white[shown], -response[shown]
 
     def _signals(self, theta: Array, w: RefitWindow, states: Array) -> tuple[Array, Array]:
         """Return the next states (N, n) and the outputs (N, l) of the model along states (N, n)."""
         model, values = self.model_at(theta), self.unpack(theta)
-        f = model.expanded(w.u)
+        f = model.expand_inputs(w.u)
         later = states @ model.A.T + f @ model.B.T + model.offset_x + w.fed
         outputs = states @ model.C.T + f @ model.D.T + model.offset_y
         for c in self.offsets:
@@ -331,7 +331,7 @@ def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: i
                         "the onset.")
     fed = np.zeros((len(y), model.nx))
     if model.feedback or model.L.any():
-        filled = interpolated(y)
+        filled = interpolate_missing(y)
         fed = filled @ model.L.T
         for g, o, column in zip(model.feedback, model.output_of, model.E.T):
             fed += np.outer(g(filled[:, o]), column)
@@ -340,7 +340,7 @@ def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: i
     held = known and not np.isnan(u[before]).any() and not np.isnan(y[before]).all()
     if held:
         part = Data(u[before], np.zeros(y[before].shape), model.dt, model.inputs, model.outputs)
-        part = part.mapped(lambda u: u, lambda _: y[before])  # a broken sensor has no reading at all
+        part = part.map_signals(lambda u: u, lambda _: y[before])  # a broken sensor has no reading at all
         white = whiten(model, part, scale=steady)
         x0, e0 = white.states[-1], np.nan_to_num(white.innovations[-1])
     after = slice(start if held else onset, None)

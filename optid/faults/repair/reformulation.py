@@ -16,7 +16,7 @@ from optid.errors import DataError, StructureError
 from optid.faults.diagnosis.records import record_of
 from optid.faults.repair.allocation import Allocation, Target, allocate, robust_allocation
 from optid.faults.repair.ambiguity import Ambiguity, advise
-from optid.faults.repair.damage import Damage, damages, merged
+from optid.faults.repair.damage import Damage, damages, merge_equivalent
 from optid.faults.repair.refitting import NODES, RefitPrior
 from optid.faults.repair.schedule import Schedule, refit
 from optid.faults.repair.virtual_sensor import Observer, observer, without_sensors
@@ -156,7 +156,7 @@ def reformulate(
     healthy = healthy if healthy is None else record_of(model, healthy)
     bounds: dict[str, Any] = {"low": low, "high": high, "weights": weights, "solver": solver}
 
-    def allocated(plant: "HammersteinSS") -> tuple[Allocation | None, list[str]]:
+    def try_allocation(plant: "HammersteinSS") -> tuple[Allocation | None, list[str]]:
         """Return the allocation, or why there is none: inputs without an interval, when no bounds are given."""
         for f, c in zip(plant.nonlinearities, plant.input_of):
             if f.basis.interval is None and (low is None or high is None):
@@ -165,17 +165,18 @@ def reformulate(
         return found, list(found.messages)
 
     if diagnosis.verdict == "healthy":
-        allocation, notes = allocated(model)
+        allocation, notes = try_allocation(model)
         return Reformulation("healthy", model, model, observer(model), allocation, None, (), None, tuple(notes))
-    broken, members = merged(model, [one for answer in diagnosis.candidates for one in damages(model, answer)]), []
+    broken, members = merge_equivalent(model,
+                                       [one for answer in diagnosis.candidates for one in damages(model, answer)]), []
     for damage in broken:
         watched, schedule = damage.with_noise(model), None
-        plant = damage.believed(watched)
+        plant = damage.nominal_model(watched)
         if damage.needs_refit and data is not None:
             plant, schedule = refit(
                 watched, without_sensors(data, damage.sensors), damage, constraints=constraints, prior=prior,
                 nodes=nodes, stage=stage, solver=solver, seed=seed, healthy=healthy)
-        allocation, notes = allocated(plant)
+        allocation, notes = try_allocation(plant)
         if damage.needs_refit and data is None:
             notes.append("no record: the plant has the sizes of the diagnosis")
         members.append(MemberModel(damage, plant, observer(plant, damage.sensors), allocation, schedule,
@@ -187,7 +188,7 @@ def reformulate(
         return Reformulation(status, model, only.model, only.observer,
                              only.allocation, only.schedule, (only,), None, only.notes)
     distrusted = sorted({name for one in broken for name in one.sensors})
-    allocation, notes = allocated(model)
+    allocation, notes = try_allocation(model)
     if len(distrusted) == model.l:
         distrusted = []
         notes = ["every sensor is suspected by some member: all are used until one member is left", *notes]

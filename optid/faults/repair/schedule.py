@@ -89,7 +89,7 @@ def refit(
         after = max(0, data.experiments[0].y.shape[0] - damage.onset)
         none = Schedule("prior", after, -(-counted // model.l), {}, (), {}, None, (), None,
                         "too few for a refit: the model is that of the diagnosis")
-        return damage.believed(model), none
+        return damage.nominal_model(model), none
     if prior is None and narrow.curves:  # of the curvatures the one that makes the record most probable
         tried = [replace(narrow, prior=replace(narrow.prior, curvature=curvature)) for curvature in BENDS]
         narrow = max(tried, key=Refitting.evidence)
@@ -108,13 +108,13 @@ def refit(
                 problem = replace(narrow, whole=word == "all with prior")
                 tried_on[word] = _solved(problem.held_out(samples), constraints, solver)
                 theta = tried_on[word].model.theta
-                scores[word] = float(np.sum(problem.linearised(theta)[0][-readings:] ** 2)) / readings
+                scores[word] = float(np.sum(problem.linearise(theta)[0][-readings:] ** 2)) / readings
             better = scores["affected only"] - scores["all with prior"] > MARGIN / readings
             stage, reason = STAGES[int(better)], "by hold-out"
     problem = replace(narrow, whole=stage == "all with prior")
     found = _solved(problem, constraints, solver)
     before, theta = model, found.model.theta
-    sensitivities = problem.linearised(theta)[1]
+    sensitivities = problem.linearise(theta)[1]
     covariance = problem.covariance(sensitivities)
     curves = tuple(_estimated(problem, curve, theta, covariance, sensitivities) for curve in problem.curves)
     for one in curves:

@@ -92,7 +92,7 @@ class Observer:
 def without_sensors(data: Data, names: Sequence[str]) -> Data:
     """Return the record without the readings of some sensors."""
     gone = np.isin(data.outputs, names)
-    return data.mapped(lambda u: u, lambda y: np.where(gone, np.nan, y)) if gone.any() else data
+    return data.map_signals(lambda u: u, lambda y: np.where(gone, np.nan, y)) if gone.any() else data
 
 
 def _output_errors(model: "HammersteinSS", covariance: Array) -> dict[str, float]:
@@ -262,5 +262,5 @@ def _stacked(model: "HammersteinSS", u: Array, y: Array, lost: tuple[str, ...], 
     gone = np.isin(model.outputs, lost)
     count = max(len(y) - lags + 1, 0)
     starts = [max(lags - 1 - lag, 0) for lag in range(lags)]
-    signal = np.hstack([y[:, ~gone], model.expanded(u)])
+    signal = np.hstack([y[:, ~gone], model.expand_inputs(u)])
     return tuple(np.hstack([part[k : k + count] for k in starts]) for part in (signal, y[:, gone]))  # type: ignore

@@ -134,7 +134,7 @@ class Sweep:
             into_state, A = _change(self.found, candidate, white.states, self.u)
             into_state[:onset] = 0.0
             into_output = np.zeros((*white.r.shape, 1))
-        return white.seen(white.predictor.respond(into_state, into_output, white.present, A))
+        return white.whiten_signature(white.predictor.respond(into_state, into_output, white.present, A))
 
     def correlations(self, r: Array) -> Array:
         """Return the correlations (N, D) of a window (N, l) with the signatures."""
@@ -298,7 +298,7 @@ def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[boo
     patterns, which = np.unique(white.present, axis=0, return_inverse=True)
     of = np.asarray(which, dtype=np.int64).ravel()
     gains = np.where(patterns[:, None, :], -steady.K, steady.L)
-    whitening = np.stack([steady.whitened(np.eye(l)[None], pattern[None])[0] for pattern in patterns])
+    whitening = np.stack([steady.whiten(np.eye(l)[None], pattern[None])[0] for pattern in patterns])
     candidates = found.candidates
     tested = [i for i, a in enumerate(able) if a]
     drifts, jumps = ([i for i in tested if candidates[i].fault_kind.course == course] for course in (DRIFT, JUMP))
@@ -355,5 +355,5 @@ def _change(found: Dictionary, candidate: Candidate, states: Any, u: Any) -> tup
     assert fault is not None
     A, B = (matrices_of(candidate.label, word, given, range(count), healthy, count)
             for word, given, healthy in (("A", fault.A, model.A), ("B", fault.B, model.B)))
-    step = np.einsum("kij,kj->ki", A - model.A, states) + np.einsum("kij,kj->ki", B - model.B, model.expanded(u))
+    step = np.einsum("kij,kj->ki", A - model.A, states) + np.einsum("kij,kj->ki", B - model.B, model.expand_inputs(u))
     return np.vstack([np.zeros((1, model.nx)), step[:-1]])[:, :, None], A

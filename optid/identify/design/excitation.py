@@ -197,7 +197,7 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
         gain = measured.gain(frequency, c)
         return 1 / np.maximum(gain / gain.max(), 1 / BOOST)
 
-    def realised(draw: int) -> Excitation:
+    def realise(draw: int) -> Excitation:
         columns = [waveform.signal(span, partial(weight, c) if shaped else None, seed + draw * like.m + c)
                    for c, span in enumerate(ranges)]
         if kind == "chirp":  # inputs that sweep in step could not be distinguished
@@ -206,7 +206,7 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
         return _expected(u, waveform, like, measured, regressor, seed + draw)
 
     while True:
-        draws = map(realised, range(1 if kind == "chirp" else candidates))
+        draws = map(realise, range(1 if kind == "chirp" else candidates))
         found = min(draws, key=lambda excitation: excitation.condition)
         low, high = waveform.band
         if found.condition <= WANTED or band is not None or kind == "levels" or high >= top:

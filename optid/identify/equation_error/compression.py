@@ -16,7 +16,7 @@ from optid.arrays import check_integer, check_weight, one_of
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.channels import Transform, model_meta
-from optid.data.levels import levelled
+from optid.data.levels import remove_levels
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
@@ -45,7 +45,7 @@ class EquationError:
     unit: float = 1.0  # size of one unit of the objective in units of the record
     unweighted: Statistics | None = None  # of the same rows without weights, where ``statistics`` has weights
     means: ExperimentMeans | None = None  # of the rows of every experiment, where each has its own constant
-    shifts: np.ndarray | None = None  # (E, l) what `levelled` subtracted from the outputs
+    shifts: np.ndarray | None = None  # (E, l) what `remove_levels` subtracted from the outputs
     between: np.ndarray | float = 0.0  # (l,) sum of squares of the mean outputs of the experiments about their mean
     # takes the statistics of every experiment, of a record of several without weights
     parts: Callable[[], list[Statistics]] | None = None
@@ -99,14 +99,14 @@ class EquationError:
             found.append(np.reshape(theta, shape))
         return found
 
-    def lifted(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    def lift(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return z of named values, for any variables of a formulation."""
         parts = [values[name] for name in ("a", "offset") if name in values]
         return np.concatenate([np.ravel(part, order="F") for part in [*parts, *self.matrices(values)]])
 
     def regression(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the coefficients (n_columns, l) of the regressor's columns in the order of the layout."""
-        return self.lifted(values)[self.columns]
+        return self.lift(values)[self.columns]
 
     @property
     def energy(self) -> np.ndarray:
@@ -158,7 +158,7 @@ class EquationError:
             a=self.past(values), b=tuple(map(np.asarray, bs)),
             nonlinearities=tuple(map(Nonlinearity, self.layout.bases, mus)), nk=self.layout.nk,
             offset=np.asarray(values["offset"], dtype=float), levels=levels, gauge=gauge, **self.meta)
-        model = model.turned(model.gain_signs) if flip else model
+        model = model.with_signs(model.gain_signs) if flip else model
         if self.shifts is not None:
             model = model.with_output_levels(self.shifts)
         return model.with_transform(self.units)
@@ -237,7 +237,7 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
                              "'oe.exact' or 'armax.exact'")
     shifts, means, between = None, None, 0.0
     if isinstance(data, Data) and constants == "each":
-        data, shifts = levelled(data)
+        data, shifts = remove_levels(data)
     bases, before = fitted_bases(data, basis), data
     units = Transform.identity(len(inputs), len(outputs))
     if own:

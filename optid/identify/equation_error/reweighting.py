@@ -20,7 +20,7 @@ import numpy as np
 from optid.core.problem import Problem
 from optid.core.program import Program, as_program
 from optid.core.terms import Values
-from optid.data.levels import levelled
+from optid.data.levels import remove_levels
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError, nearest
@@ -86,12 +86,12 @@ def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError
 def _reweighted(data: Data, pose: Callable[[EquationError], Problem], structure: dict[str, Any], kind: str,
                 threshold: float, convex: bool) -> Procedure:
     whole = compress(data, **structure)
-    record = data if whole.shifts is None else levelled(data)[0]
+    record = data if whole.shifts is None else remove_levels(data)[0]
     used = _Rows(in_units(record, whole.units), whole.layout)
     problem, base = whole, as_program(pose(whole), step=True)
     scale = base.scale  # the weights of a pass are no unit of the data
 
-    def weighted(sizes: list[np.ndarray], start: Values) -> tuple[Program, list[np.ndarray]]:
+    def weighted_program(sizes: list[np.ndarray], start: Values) -> tuple[Program, list[np.ndarray]]:
         """Return the programme and the weights of a pass, which starts from the solution of the pass before."""
         weights = used.only(_weights(r, kind, width) for r in sizes)
         compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics,
@@ -111,7 +111,7 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Problem], structure:
             errors = used.residuals(problem, solution)
             spread = max(float(np.nanmedian(np.concatenate(_sizes(errors)))) / NORMAL_MEDIAN, 1e-300)
             width = spread * (1.0 if kind == "l1" else threshold)
-            program, weights = weighted(_sizes(errors), dict(solution.values) if weights else base.start)
+            program, weights = weighted_program(_sizes(errors), dict(solution.values) if weights else base.start)
         if not used.leave_out(errors, problem.regression(solution.values)):
             break
     best = gap = np.inf
@@ -132,7 +132,7 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Problem], structure:
             break
         best, gap = min(best, found.objective) if final else np.inf, now
         final = width <= spread * threshold
-        program, weights = weighted(sizes, dict(solution.values))
+        program, weights = weighted_program(sizes, dict(solution.values))
     return replace(found, figures=used.figures(kind, problem.units.y_scale[0] * width))
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from optid.arrays import Array
-from optid.identify.informativity.signals import WhitenedRegression, delayed, respond, whitened
+from optid.identify.informativity.signals import WhitenedRegression, delay, respond, whiten_rows
 
 SLOWEST, FASTEST, COUNT = 0.5, 0.8, 15  # time constants: share of the longest experiment, samples, their number
 TAUS, DELAYS, POWERS = (2.0, 6.0, 18.0, 54.0), (0, 3, 8, 16, 32), (1, 2, 3)  # of several inputs together, in samples
@@ -48,12 +48,12 @@ def scan(regression: WhitenedRegression, drive: Sequence[Array], longest: int, p
     inner, own = np.zeros((poles.size, longest + 1)), np.zeros((poles.size, longest + 1))
     both, whole = np.zeros((first.size, longest + 1)), 0.0
     for u, y in zip(drive, regression.y):
-        white = whitened(regression.noise, y)
+        white = whiten_rows(regression.noise, y)
         if len(white) < 2:
             continue
         white = white - white.mean()
         whole += float(white @ white)
-        single = np.array([whitened(regression.noise, respond((p,), u)) for p in poles])
+        single = np.array([whiten_rows(regression.noise, respond((p,), u)) for p in poles])
         lags = min(longest, len(white) - 1) + 1
         inner[:, :lags] += _correlations(white, single, lags)
         own[:, :lags] += _energies(single, single_poles, single_poles, lags)
@@ -104,10 +104,10 @@ def apart(regression: WhitenedRegression, inputs: Sequence[Array], least: int, l
     The inputs are (T, m) per experiment; the responses, (T,) per experiment, are those of powers of the input.
     """
     lags = sorted({max(lag, least) for lag in DELAYS if lag <= max(longest, least)})
-    columns = [[np.column_stack([delayed(v, lag) for power in POWERS for tau in TAUS
+    columns = [[np.column_stack([delay(v, lag) for power in POWERS for tau in TAUS
                                  for v in (respond((float(np.exp(-1 / tau)),), u[:, c] ** power),) for lag in lags])
                 for u in inputs] for c in range(inputs[0].shape[1])]
-    both, _ = regression.projected([np.hstack(several) for several in zip(*columns)], 1.0)
+    both, _ = regression.project_columns([np.hstack(several) for several in zip(*columns)], 1.0)
     size = np.linalg.norm(both[:, :-1], axis=0) + 1e-300
     x = both[:, :-1] / size
     theta = np.linalg.solve(x.T @ x + RIDGE * np.eye(size.size), x.T @ both[:, -1]) / size

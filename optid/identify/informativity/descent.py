@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optid.arrays import Array
-from optid.identify.informativity.signals import Poles, WhitenedRegression, delayed, respond
+from optid.identify.informativity.signals import Poles, WhitenedRegression, delay, respond
 
 ROUNDING = 1e-13
 STEPS, FARTHEST, NUDGE = 12, 1.0, 1e-6  # of a descent; longest step in a logarithm; step of a difference
@@ -98,7 +98,7 @@ class FittedTerm:
 def columns_of(term: Term, values: Sequence[Array]) -> list[Array]:
     """Return what each coefficient of B multiplies, (T, zeros + 1) per experiment."""
     responses = [respond(term.poles, u) for u in values]
-    return [np.column_stack([delayed(v, term.lag + j) for j in range(term.zeros + 1)]) for v in responses]
+    return [np.column_stack([delay(v, term.lag + j) for j in range(term.zeros + 1)]) for v in responses]
 
 
 def slowest_of(poles: Poles) -> float:
@@ -106,7 +106,7 @@ def slowest_of(poles: Poles) -> float:
     return 1.0 if np.any(poles == 1) else float(np.max(np.abs(poles), initial=0.0))
 
 
-def refined(regression: WhitenedRegression, drive: Drive, term: Term, below: float = np.inf) -> FittedTerm:
+def refine_poles(regression: WhitenedRegression, drive: Drive, term: Term, below: float = np.inf) -> FittedTerm:
     """Descend over the poles of one response by Gauss-Newton steps, each along coefficients and poles together.
 
     The descent ends early where its steps promise no criterion near `below`.
@@ -118,7 +118,7 @@ def refined(regression: WhitenedRegression, drive: Drive, term: Term, below: flo
         count = at.z.size + at.zeros + 2 + free + regression.noise.size - 1 + drive.parameters
         return float(rows * np.log(max(energy / rows, ROUNDING**2)) + count * np.log(rows))
 
-    energy, theta, free, columns = solved(regression, drive, at)
+    energy, theta, free, columns = solve_coefficients(regression, drive, at)
     for turn in range(STEPS if at.z.size and regression.count > at.z.size + at.zeros + 1 else 0):
         slowest, moved = slowest_of(at.poles), []
         for one in np.eye(at.z.size) * NUDGE:
@@ -132,7 +132,7 @@ def refined(regression: WhitenedRegression, drive: Drive, term: Term, below: flo
         step *= min(1.0, FARTHEST / max(float(np.max(np.abs(step), initial=0.0)), 1e-300))
         for share in (1.0, 0.25, 0.05):
             z = np.clip(at.z + share * step, -4, most)
-            found = solved(regression, drive, at.at(z))
+            found = solve_coefficients(regression, drive, at.at(z))
             if found[0] < energy:
                 break
         else:
@@ -144,7 +144,8 @@ def refined(regression: WhitenedRegression, drive: Drive, term: Term, below: flo
     return FittedTerm(at, drive, energy, theta, criterion(energy))
 
 
-def solved(regression: WhitenedRegression, drive: Drive, term: Term) -> tuple[float, Array, int, list[Array]]:
+def solve_coefficients(regression: WhitenedRegression, drive: Drive, term: Term) -> tuple[float, Array, int,
+                                                                                          list[Array]]:
     """Return sum of squares, coefficients of B, what was projected out, and the columns."""
     columns = columns_of(term, drive.values)
     energy, theta, _, free = regression.solve(columns, slowest_of(term.poles))

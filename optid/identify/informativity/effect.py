@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from optid.arrays import Array
-from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
+from optid.identify.informativity.lags import lag_columns, memory, powers, stack_experiments, test_addition
 from optid.identify.informativity.process import LATEST, DelayedResponse, Process
-from optid.identify.informativity.signals import RecordSignals, WhitenedRegression, delayed, respond
+from optid.identify.informativity.signals import RecordSignals, WhitenedRegression, delay, respond
 from optid.models.recursions import lfilter
 from optid.statistics.coloured import short_autoregression
 
@@ -52,23 +52,23 @@ def effect(signals: RecordSignals, c: int, o: int, process: Process, names: tupl
                                                   for x in _others(u[:, i], process.responses[i], least, latest).T)])
               for u in signals.u]
 
-    def tested(outputs: tuple[Array, ...]) -> tuple[float, float, int]:
-        columns = stacked(signals, na, 0, lambda i, first, last: [
+    def test_outputs(outputs: tuple[Array, ...]) -> tuple[float, float, int]:
+        columns = stack_experiments(signals, na, 0, lambda i, first, last: [
             part[signals.present[i][first:last, o]] for part in (
-                np.hstack([others[i][first:last], lagged(outputs[i], range(1, na + 1), first, last)]),
+                np.hstack([others[i][first:last], lag_columns(outputs[i], range(1, na + 1), first, last)]),
                 more[i][first:last], outputs[i][first:last])])
         if not columns:
             return 1.0, 0.0, 0
         base, bank, y = columns
         if len(y) <= base.shape[1] + bank.shape[1]:
             return 1.0, 0.0, 0
-        found = added(y, base, bank)
+        found = test_addition(y, base, bank)
         return found.p_value, found.share, found.columns
 
     outputs = signals.outputs(o)
-    p_value, share, columns = tested(outputs)
+    p_value, share, columns = test_outputs(outputs)
     if columns and CLEAR < p_value < DOUBTFUL:
-        p_value = _simulated(signals, o, outputs, others, p_value, tested, seed)
+        p_value = _simulated(signals, o, outputs, others, p_value, test_outputs, seed)
     return Effect(*names, p_value, share)
 
 
@@ -111,12 +111,12 @@ def _bank(x: Array, levels: int, least: int, latest: int) -> Array:
     """Return an input, and its square, behind a few poles after a few delays."""
     lags = sorted({max(lag, least) for lag in DELAYS if lag <= max(latest, least)})
     responses = [respond((float(np.exp(-1 / tau)),), one) for one in powers(x, levels, 2) for tau in TAUS]
-    return np.column_stack([delayed(v, lag) for v in responses for lag in lags])
+    return np.column_stack([delay(v, lag) for v in responses for lag in lags])
 
 
 def _others(x: Array, response: DelayedResponse, least: int, latest: int) -> Array:
     """Return the past of another input: its bank, first lags, and response."""
-    first = [delayed(x - x[0], least + j) for j in range(LAGS)]
+    first = [delay(x - x[0], least + j) for j in range(LAGS)]
     shaped = respond(response.poles, x)
     return np.column_stack([_bank(x, 1, least, latest), *first,
-                            *(delayed(shaped, response.nk + j) for j in range(2))])
+                            *(delay(shaped, response.nk + j) for j in range(2))])

@@ -14,9 +14,9 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.data.repeats import copies
-from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
+from optid.identify.informativity.lags import lag_columns, memory, powers, stack_experiments, test_addition
 from optid.identify.informativity.process import Process
-from optid.identify.informativity.signals import RecordSignals, delayed, respond
+from optid.identify.informativity.signals import RecordSignals, delay, respond
 
 LEVEL = 2e-4  # of the test of one input, shared by the outputs
 LED = 0.9  # share of the innovations of one of several inputs that outputs must leave at most, if its future is silent
@@ -79,25 +79,25 @@ def _tested(signals: RecordSignals, c: int, o: int, process: Process) -> tuple[f
 
     def build(i: int, first: int, last: int) -> list[Array]:
         u, y = signals.u[i], signals.y[i][:, o]
-        past = [np.ones((last - first, 1)), lagged(y, range(1, na + 1), first, last)]
+        past = [np.ones((last - first, 1)), lag_columns(y, range(1, na + 1), first, last)]
         for other in range(u.shape[1]):
             response = process.responses[other]
             for x in powers(u[:, other], signals.levels(other)):
                 shaped = respond(response.poles, x)
-                past += [lagged(x, range(1, lags + 1), first, last),
-                         np.column_stack([delayed(shaped, max(response.nk, 1) + j)[first:last] for j in range(SHAPED)])]
+                past += [lag_columns(x, range(1, lags + 1), first, last),
+                         np.column_stack([delay(shaped, max(response.nk, 1) + j)[first:last] for j in range(SHAPED)])]
         now = np.column_stack([x[first:last] for x in powers(u[:, c], levels)])
         there = signals.present[i][first:last, o]
-        return [part[there] for part in (np.hstack(past), now, lagged(u[:, c], range(-leads, 0), first, last),
+        return [part[there] for part in (np.hstack(past), now, lag_columns(u[:, c], range(-leads, 0), first, last),
                                          y[first:last])]
 
-    columns = stacked(signals, max(na, lags), leads, build)
+    columns = stack_experiments(signals, max(na, lags), leads, build)
     if not columns or len(columns[3]) < 2 * columns[0].shape[1]:
         return 1.0, 1.0, True
     past, now, future, y = columns
     again = _repeats(signals, c)
-    ahead = added(y, np.hstack([past, now]), future, again)
-    present = added(y, past, now, again)
+    ahead = test_addition(y, np.hstack([past, now]), future, again)
+    present = test_addition(y, past, now, again)
     slope = float(np.linalg.lstsq(np.hstack([past, now[:, :1]]), y, rcond=1e-10)[0][-1])
     response = process.responses[c]
     sign = float(response.b.sum()) * (-1.0 if np.count_nonzero(response.poles.real > 1) % 2 else 1.0)
@@ -122,15 +122,15 @@ def outside(signals: RecordSignals, c: int, order: int = 12, beside: tuple[int, 
     The outputs, and the inputs `beside` them.
     """
     order = max(min(order, signals.longest // 12), 1)
-    columns = stacked(signals, order, 0, lambda i, first, last: (
-        np.hstack([np.ones((last - first, 1)), lagged(signals.u[i][:, c], range(1, order + 1), first, last)]),
-        np.hstack([lagged(x, range(order + 1), first, last)
+    columns = stack_experiments(signals, order, 0, lambda i, first, last: (
+        np.hstack([np.ones((last - first, 1)), lag_columns(signals.u[i][:, c], range(1, order + 1), first, last)]),
+        np.hstack([lag_columns(x, range(order + 1), first, last)
                    for x in (*signals.y[i].T, *(signals.u[i][:, other] for other in beside))]),
         signals.u[i][first:last, c]))
     if not columns:
         return 1.0
     own, outputs, u = columns
-    return 1.0 - added(u, own, outputs).share
+    return 1.0 - test_addition(u, own, outputs).share
 
 
 def _moving(signals: RecordSignals, c: int) -> float:
@@ -141,9 +141,9 @@ def _follows(signals: RecordSignals, c: int, o: int) -> bool:
     """Whether input c follows output o and its own past by one law at most samples, whatever moves it at others."""
     if _moving(signals, c) < MOVING:
         return False
-    columns = stacked(signals, MEMORY, 0, lambda i, first, last: (
-        np.hstack([np.ones((last - first, 1)), lagged(signals.u[i][:, c], range(1, MEMORY + 1), first, last)]),
-        lagged(signals.y[i][:, o], range(MEMORY + 1), first, last), signals.u[i][first:last, c]))
+    columns = stack_experiments(signals, MEMORY, 0, lambda i, first, last: (
+        np.hstack([np.ones((last - first, 1)), lag_columns(signals.u[i][:, c], range(1, MEMORY + 1), first, last)]),
+        lag_columns(signals.y[i][:, o], range(MEMORY + 1), first, last), signals.u[i][first:last, c]))
     if not columns or len(columns[2]) < 20 * MEMORY:
         return False
     own, output, u = columns

@@ -23,7 +23,7 @@ class Added:
     columns: int
 
 
-def added(target: Array, base: Array, more: Array, repeats: float = 1.0) -> Added:
+def test_addition(target: Array, base: Array, more: Array, repeats: float = 1.0) -> Added:
     """Test whether further columns (N, k) explain what a base (N, n) leaves of a target (N,).
 
     Where the rows say the same several times, what they save counts once.
@@ -52,12 +52,12 @@ def _span(columns: Array) -> Array:
     return left[:, size > 1e-8 * size[0]] if size.size else left
 
 
-def lagged(x: Array, lags: Iterable[int], first: int, last: int) -> Array:
+def lag_columns(x: Array, lags: Iterable[int], first: int, last: int) -> Array:
     """Return x(k - lag) for k = first ... last - 1, one column per lag; negative lags are leads."""
     return np.column_stack([x[first - lag : last - lag] for lag in lags] or [np.zeros((last - first, 0))])
 
 
-def stacked(signals: RecordSignals, before: int, after: int, build: Callable[[int, int, int], Sequence[Array]]
+def stack_experiments(signals: RecordSignals, before: int, after: int, build: Callable[[int, int, int], Sequence[Array]]
             ) -> list[Array]:
     """Stack what `build(experiment, first, last)` returns over all experiments that are longer than both margins."""
     found = [build(i, before, len(y) - after) for i, y in enumerate(signals.y) if len(y) > before + after + 1]
@@ -72,8 +72,8 @@ def powers(x: Array, levels: int, most: int = 3) -> list[Array]:
 def memory(signals: RecordSignals, o: int, most: int = 12) -> int:
     """Return the order of an autoregression of an output by Akaike's criterion, over common rows."""
     most = max(min(most, signals.longest // 12), 1)
-    columns = stacked(signals, most, 0, lambda i, first, last: (
-        lagged(signals.y[i][:, o], range(1, most + 1), first, last), signals.y[i][first:last, o]))
+    columns = stack_experiments(signals, most, 0, lambda i, first, last: (
+        lag_columns(signals.y[i][:, o], range(1, most + 1), first, last), signals.y[i][first:last, o]))
     if not columns:
         return 1
     past, now = columns

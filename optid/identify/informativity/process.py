@@ -22,10 +22,10 @@ from optid.identify.informativity.descent import (
     FittedTerm,
     Term,
     columns_of,
-    refined,
+    refine_poles,
     slowest_of,
 )
-from optid.identify.informativity.signals import Poles, RecordSignals, WhitenedRegression, delayed, respond
+from optid.identify.informativity.signals import Poles, RecordSignals, WhitenedRegression, delay, respond
 from optid.models.roots import roots_of
 from optid.statistics.coloured import short_autoregression
 
@@ -203,7 +203,8 @@ def _turned(regression: WhitenedRegression, drive: Drive, least: int, longest: i
     energy = {one.lag: one.energy for one in starts if one.lag >= least}
     lowest = [one for one in starts if one.lag >= least and one.energy <= min(
         energy.get(one.lag - 1, np.inf), energy.get(one.lag + 1, np.inf))]
-    found = [refined(regression, drive, Term.of(one.poles, one.lag, one.zeros), plain.criterion) for one in lowest[:2]]
+    found = [refine_poles(regression, drive, Term.of(one.poles, one.lag, one.zeros),
+                          plain.criterion) for one in lowest[:2]]
     best = min(found, key=lambda p: p.criterion, default=plain)
     return _searched(regression, drive, least, longest, best.term) if best.criterion < plain.criterion else plain
 
@@ -213,23 +214,23 @@ def _searched(regression: WhitenedRegression, drive: Drive, least: int, longest:
     """Refine the best of scans, and then neighbouring structures as long as the criterion falls."""
     tried: dict[tuple[int, ...], FittedTerm] = {}
 
-    def fitted(term: Term) -> FittedTerm:
+    def fit_term(term: Term) -> FittedTerm:
         if term.key not in tried:
             least = min((p.criterion for p in tried.values()), default=np.inf)
-            tried[term.key] = refined(regression, drive, term, least)
+            tried[term.key] = refine_poles(regression, drive, term, least)
         return tried[term.key]
 
     terms = [] if start is None else [start]
     for starts in scans:
         late = [one for one in starts if one.lag >= least]
         terms += [Term.of(one.poles, one.lag) for one in late[: KEPT if start is None else 2]]
-    best = min(map(fitted, terms), key=lambda p: p.criterion)
+    best = min(map(fit_term, terms), key=lambda p: p.criterion)
     exact = EXACT * regression.count
     oscillating = list(_oscillating(regression, drive, best.term)) if scans else []
     for _ in range(MOVES):
         if best.energy <= exact:
             break
-        near = [fitted(term) for term in (*oscillating, *_neighbours(best.term, least, longest, drive))]
+        near = [fit_term(term) for term in (*oscillating, *_neighbours(best.term, least, longest, drive))]
         better = min(near, key=lambda p: p.criterion)
         if not better.criterion < best.criterion - 1e-6:
             break
@@ -267,7 +268,7 @@ def _oscillating(regression: WhitenedRegression, drive: Drive, term: Term) -> It
     n = 2 * LARGEST
     rows, targets = [], []
     for y, u in zip(regression.y, drive.values):
-        v = delayed(u - u[0], term.lag)
+        v = delay(u - u[0], term.lag)
         if len(y) > 3 * n:
             lags = ((x, j) for x, first in ((y, 1), (v, 0)) for j in range(first, n))
             rows.append(np.column_stack([x[n - j : len(x) - j] for x, j in lags]))
@@ -289,7 +290,7 @@ def _oscillating(regression: WhitenedRegression, drive: Drive, term: Term) -> It
 def _bent(regression: WhitenedRegression, drive: Drive, term: Term, nodes: Array) -> Drive | None:
     """Fit f, piecewise linear between nodes, through a response; with slope one on average."""
     hats = [np.column_stack([np.interp(u, nodes, one) for one in np.eye(nodes.size)[1:]]) for u in drive.values]
-    columns = [np.column_stack([delayed(respond(term.poles, h), term.lag) for h in hat.T]) for hat in hats]
+    columns = [np.column_stack([delay(respond(term.poles, h), term.lag) for h in hat.T]) for hat in hats]
     _, theta, _, _ = regression.solve(columns, slowest_of(term.poles))
     heights = np.concatenate([[0.0], theta])
     values = [np.interp(u, nodes, heights) for u in drive.values]
@@ -343,7 +344,8 @@ def _interval(regression: WhitenedRegression, point: FittedTerm, least: int, lon
         lag, term, step, grows = point.term.lag, point.term, 1, True
         while step:  # twice as far as long as nothing excludes it: an input without effect has any delay
             there = lag + sign * step
-            found = refined(regression, point.drive, replace(term, lag=there)) if least <= there <= longest else None
+            found = refine_poles(regression, point.drive,
+                                 replace(term, lag=there)) if least <= there <= longest else None
             if found is None or regression.count * np.log(
                     max(found.energy, floor) / max(point.energy, floor)) > LIKELY:
                 step, grows = step // 2, False

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.data.stretches import interpolated
+from optid.data.stretches import interpolate_missing
 from optid.models.recursions import lfilter
 
 SAMPLES, EXPERIMENTS = 30_000, 40  # that are read, from the beginning of a record
@@ -47,8 +47,8 @@ class RecordSignals:
         if data.n_samples > 1.1 * SAMPLES:
             data = data.split(SAMPLES / data.n_samples)[0]
         experiments = [e for e in data.experiments if e.n_samples > 1][:EXPERIMENTS]
-        u = [held(e.u) for e in experiments]
-        y = [interpolated(e.y) for e in experiments]
+        u = [hold_last(e.u) for e in experiments]
+        y = [interpolate_missing(e.y) for e in experiments]
         scales = []
         for i, several in enumerate((u, y)):
             whole = np.vstack(several)
@@ -82,7 +82,7 @@ class RecordSignals:
         return np.unique(np.round(np.concatenate(self.inputs(c)), 9)).size
 
 
-def held(samples: Array) -> Array:
+def hold_last(samples: Array) -> Array:
     """Repeat the last value where samples (N, c) are missing, and the first one before it."""
     filled = np.array(samples, dtype=float)
     for column in filled.T:
@@ -106,12 +106,12 @@ def respond(poles: Sequence[complex] | Poles, drive: Array) -> Array:
     return lfilter([1.0], np.real(a), x)
 
 
-def delayed(x: Array, lag: int) -> Array:
+def delay(x: Array, lag: int) -> Array:
     """Return x(k - lag), zero before the record."""
     return np.concatenate([np.zeros(min(lag, len(x))), x[: max(len(x) - lag, 0)]])
 
 
-def whitened(noise: Array, x: Array) -> Array:
+def whiten_rows(noise: Array, x: Array) -> Array:
     """Filter the rows of x, (T,) or (T, k), by the polynomial of a noise model, where it fits."""
     past = noise.size - 1
     return sum((a * x[past - j : len(x) - j] for j, a in enumerate(noise)), np.zeros((len(x) - past, *x.shape[1:])))
@@ -149,14 +149,14 @@ class WhitenedRegression:
     @cached_property
     def white(self) -> tuple[Array, ...]:
         """The whitened output."""
-        return tuple(whitened(self.noise, y)[rows] for y, rows in zip(self.y, self.rows))
+        return tuple(whiten_rows(self.noise, y)[rows] for y, rows in zip(self.y, self.rows))
 
-    def projected(self, columns: Sequence[Array], slowest: float) -> tuple[Array, int]:
+    def project_columns(self, columns: Sequence[Array], slowest: float) -> tuple[Array, int]:
         """Return [columns | output], (rows, k + 1), whitened and beside level and decay, and their free parameters."""
         found: list[Array] = []
         free = 0
         for x, y, rows in zip(columns, self.white, self.rows):
-            white = whitened(self.noise, x)
+            white = whiten_rows(self.noise, x)
             both = np.empty((y.size, x.shape[1] + 1))
             both[:, :-1], both[:, -1] = white if rows.all() else white[rows], y
             k = np.arange(rows.size, dtype=float)[rows]
@@ -173,7 +173,7 @@ class WhitenedRegression:
 
     def solve(self, columns: Sequence[Array], slowest: float) -> tuple[float, Array, Array, int]:
         """Return sum of squares, coefficients, whitened errors, and the parameters that were projected out."""
-        both, free = self.projected(columns, slowest)
+        both, free = self.project_columns(columns, slowest)
         theta = np.linalg.lstsq(both[:, :-1], both[:, -1], rcond=1e-9)[0] if both.shape[1] > 1 else np.zeros(0)
         errors = both[:, -1] - both[:, :-1] @ theta
         return float(errors @ errors), theta, errors, free
@@ -181,7 +181,7 @@ class WhitenedRegression:
     def residuals(self, columns: Sequence[Array], theta: Array, slowest: float) -> list[Array]:
         """Return the errors before whitening, without level and decay, NaN where the output is missing."""
         plain = replace(self, noise=np.ones(1), present=tuple(np.ones_like(there) for there in self.present))
-        both, _ = plain.projected(columns, slowest)
+        both, _ = plain.project_columns(columns, slowest)
         errors = both[:, -1] - both[:, :-1] @ theta
         ends = np.cumsum([len(y) for y in self.y])[:-1]
         return [np.where(there, e, np.nan) for e, there in zip(np.split(errors, ends), self.present)]

@@ -16,7 +16,7 @@ from optid.errors import DataError
 from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.prediction_error.descent import beside_poles
 from optid.models.roots import roots_of
-from optid.statistics.linearised import linearised
+from optid.statistics.linearised import linearise_errors
 
 # shares of the imaginary part of a pair that are tried
 SHARES = (0.03, 0.2, 0.5, 0.8, 0.95, 0.99, 0.999, 1.0, 1.001, 1.01, 1.05, 1.25, 2.0)
@@ -57,18 +57,18 @@ def along_border(criterion: Criterion, depth: Callable[[Array], float], x: Array
         share: of the sum of squared errors.
         alone: whether everything but the poles is free, and fitted again; else it stays as it is.
     """
-    def fitted(x: Array) -> tuple[Array, float]:
+    def fit_rest(x: Array) -> tuple[Array, float]:
         if alone:
             return _fitted(criterion, x)
         return x, criterion.value(x) if criterion.admissible(x) else np.inf
 
-    def allowed(two: Array) -> bool:
+    def is_allowed(two: Array) -> bool:
         return depth(two) >= -ROUNDING
 
     for _ in range(MOVES):
         poles = poles_of(criterion, x)
         inside = depth(poles) >= -OUTSIDE
-        if inside and criterion.data.n_samples > SHORT and not _on_border(poles, allowed):
+        if inside and criterion.data.n_samples > SHORT and not _on_border(poles, is_allowed):
             break
         best, least = None, np.inf
         if inside:
@@ -76,13 +76,13 @@ def along_border(criterion: Criterion, depth: Callable[[Array], float], x: Array
                 end = beside_poles(criterion, x, tolerance=FITTED, progress=SETTLED)
                 point, least = end.x, end.value
             else:
-                point, least = fitted(x)
-            best = point if allowed(poles) and least < criterion.value(x) * (1 - share) else None
-            least *= 1 - share if allowed(poles) else 1 + share  # a rounding outside, the border is as good
+                point, least = fit_rest(x)
+            best = point if is_allowed(poles) and least < criterion.value(x) * (1 - share) else None
+            least *= 1 - share if is_allowed(poles) else 1 + share  # a rounding outside, the border is as good
         for pair in _couples(poles):
             two, others = poles[list(pair)], np.delete(poles, pair)
-            for mean, square in _moves(two, allowed) if depth(others) >= -OUTSIDE else ():
-                point, value = fitted(_moved(criterion, x, two, others, mean, square))
+            for mean, square in _moves(two, is_allowed) if depth(others) >= -OUTSIDE else ():
+                point, value = fit_rest(_moved(criterion, x, two, others, mean, square))
                 if value < least:
                     best, least = point, value
         if best is None:
@@ -183,7 +183,7 @@ def meet(criterion: Criterion, x: Array) -> bool:
     return _step(criterion, x, hold_c=False)[1] <= FITTED * value
 
 
-def doubled(criterion: Criterion, depth: Callable[[Array], float], x: Array) -> Array | None:
+def with_double_pole(criterion: Criterion, depth: Callable[[Array], float], x: Array) -> Array | None:
     """Return x with the first pair near the real axis made an all but double pole on the border; None without one."""
     poles = poles_of(criterion, x)
     for pair in _couples(poles):
@@ -194,7 +194,7 @@ def doubled(criterion: Criterion, depth: Callable[[Array], float], x: Array) -> 
     return None
 
 
-def slowed(criterion: Criterion, x: Array) -> list[Array]:
+def with_slow_poles(criterion: Criterion, x: Array) -> list[Array]:
     """Return x with two neighbouring poles made slow, and everything else fitted: one of two real ones, or a pair.
 
     With a slow pole the static gain, which words about f refer to, may oppose the first response. A pair that rings
@@ -219,7 +219,7 @@ def _step(criterion: Criterion, x: Array, hold_c: bool) -> tuple[Array, float]:
     held = np.concatenate([np.arange(x.size)[at[part]] for part in parts if part in at])
     rest, step = np.setdiff1d(np.arange(x.size), held), np.zeros(x.size)
     # without weight on what changes no output, which may be needed here
-    matrix, errors = linearised(criterion.rows(x), unknowns.experiments, unknowns.memory, unknowns.shared,
+    matrix, errors = linearise_errors(criterion.rows(x), unknowns.experiments, unknowns.memory, unknowns.shared,
                                 method="qr").whole
     sizes = np.maximum(np.linalg.norm(matrix[:, rest], axis=0), 1e-300)
     step[rest] = -np.linalg.lstsq(matrix[:, rest] / sizes, errors, rcond=1e-12)[0] / sizes
@@ -242,7 +242,7 @@ def _fitted(criterion: Criterion, x: Array) -> tuple[Array, float]:
             return x, value
         found, there = np.inf, x
         for part in 0.5 ** np.arange(PARTS):
-            there = criterion.confined(x + part * step)
+            there = criterion.confine(x + part * step)
             found = criterion.value(there) if criterion.admissible(there) else np.inf
             if found < value:
                 break

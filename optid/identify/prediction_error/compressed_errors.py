@@ -21,7 +21,7 @@ from optid.identify.prediction_error.error_noise import ErrorNoise
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.program.compressed import Spread, degrees_of_freedom, white_spread
 from optid.program.units import energy_unit
-from optid.statistics.coloured import scattered
+from optid.statistics.coloured import score_covariance
 from optid.statistics.linearised import Linearised
 
 NO_EFFECT = 1e-9  # size of an effect on the errors, relative to the largest, that is rounding
@@ -85,13 +85,13 @@ class CompressedErrors:
         """Positions (n, 1) in z of the coefficients of the columns."""
         return np.arange(len(self.reference))[:, None]
 
-    def lifted(self, values: Mapping[str, Array]) -> Array:
+    def lift(self, values: Mapping[str, Array]) -> Array:
         """Return z."""
         return self.criterion.variables.pack(values)
 
     def one_step_fit(self, values: Mapping[str, Array]) -> Array | None:
         """Return the fit in % on the record: one step ahead an output-error model predicts what it simulates."""
-        value = self.at.after(self.lifted(values) - self.reference)
+        value = self.at.after(self.lift(values) - self.reference)
         return 100.0 * (1.0 - np.sqrt(value / np.maximum(self.energy, 1e-300)))
 
     @property
@@ -128,7 +128,7 @@ class CompressedErrors:
         meat = np.zeros((unknowns.size, unknowns.size))
         for i, root in enumerate(noise.roots):
             places = self._of(i)
-            meat[np.ix_(places, places)] += scattered(rows(i), noise.response, root)
+            meat[np.ix_(places, places)] += score_covariance(rows(i), noise.response, root)
         covariance = moves.T @ meat @ moves
         taken = 1 + float(np.trace(covariance)) / max(self.at.value, 1e-300)  # what the fit has taken out of the errors
         back = np.linalg.inv(np.linalg.cholesky(self.criterion.weight).T)

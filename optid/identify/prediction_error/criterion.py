@@ -62,7 +62,7 @@ class Places:
         root, errors = at.whole
         return Squares(root[:, self.columns], root @ z0 - errors, at.remainder, tuple(self.names))
 
-    def stacked(self, variables: Mapping[str, cp.Expression]) -> cp.Expression:
+    def stack(self, variables: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the variables as the vector of the unknowns."""
         return cp.hstack([variables[name] if variables[name].ndim == 1 else
                           cp.vec(variables[name], order="F" if part == "x0" else "C")
@@ -115,7 +115,7 @@ class Criterion(ABC):
         count = self.data.n_experiments
         return [f"[{i}]" if count > 1 else "" for i in range(1, count + 1)]
 
-    # (E, l) what `levelled` subtracted from the outputs, where every experiment has constants of its own
+    # (E, l) what `remove_levels` subtracted from the outputs, where every experiment has constants of its own
     shifts: Array | None = None
 
     @cached_property
@@ -157,7 +157,7 @@ class Criterion(ABC):
     def admissible(self, x: Array) -> bool:
         """Whether the errors exist at x: its filters are stable."""
 
-    def confined(self, x: Array) -> Array:
+    def confine(self, x: Array) -> Array:
         """Return the nearest admissible point where that is one of parts that no constraint is about, else x."""
         return x
 
@@ -170,7 +170,7 @@ class Criterion(ABC):
         part = x[self.unknowns.slices[b]]
         return -1.0 if part[np.argmax(np.abs(part))] < 0 else 1.0
 
-    def normalised(self, x: Array) -> Array:
+    def normalise(self, x: Array) -> Array:
         """Return the same model in the gauge."""
         x, at = np.array(x), self.unknowns.slices
         for mu, b in self.unknowns.products:

@@ -45,7 +45,7 @@ class Curvature:
         self.used = bool(abs(plain - now - fall) < abs(plain - fall)) or not self.matrix.any()
         self.matrix = matrix
 
-    def added(self, at: Linearised) -> Linearised:
+    def add_to(self, at: Linearised) -> Linearised:
         """Return errors with the same sum of squares and gradient at the point, and with the curvature."""
         factor, errors = at.whole
         try:

@@ -77,7 +77,7 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
         progress: relative fall over `CREEPING` steps below which it stops, too.
         start: name for the record.
     """
-    x = criterion.normalised(x)
+    x = criterion.normalise(x)
     at = criterion.linearise(x)
     if not np.isfinite(at.value):
         return Descent(x, at, 0, False, "the run leaves its range", start, True)
@@ -101,7 +101,7 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
         step[moving] = _damped(matrix[:, moving], errors, np.where(scale > 0, scale, 1.0), damping)
         expected = at.reach - float(np.sum((matrix @ step + errors) ** 2))
         whole = step if criterion.bends else np.concatenate([step, at.follow(step)])
-        moved = criterion.normalised(x + whole)
+        moved = criterion.normalise(x + whole)
         allowed = criterion.admissible(moved)
         new = None
         if allowed and criterion.value(moved) < (1 + ROUNDING) * at.value:  # most steps that fail are told by the value

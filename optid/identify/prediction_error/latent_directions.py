@@ -21,7 +21,7 @@ LARGEST, FAR, OFF = 8, 1e3, 1.05
 def directions(errors: StateErrors, point: StatePoint, latent: Latent, rng: np.random.Generator) -> Iterator[Array]:
     """Yield rows [Cz, Dz, constant] with z in [-1, 1]: states, inputs, outputs, factors of responses, random ones."""
     n, m = errors.unknowns.n, errors.unknowns.expansion.m
-    states = np.vstack(errors.visited(point))
+    states = np.vstack(errors.run_states(point))
     signals = np.hstack([states, np.vstack([e.u for e in errors.data.experiments])])
     moving = np.concatenate([np.ones(n), np.full(m, float(latent.moved))])
     spread = signals.std(axis=0)

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from optid.arrays import LARGEST_INTEGER, check_integer, one_of, shown
+from optid.arrays import LARGEST_INTEGER, check_integer, one_of, short_repr
 from optid.bases import Basis, Polynomial, parse
 from optid.errors import StructureError
 from optid.identify.prediction_error.latent_search import add_channels, add_output_functions
@@ -39,7 +39,7 @@ def _on_latent(given: Basis | str) -> Basis:
     """Return the basis of a latent function, on [-1, 1]."""
     basis = parse(given) if isinstance(given, str) else given
     if not isinstance(basis, Basis):
-        raise StructureError(f"the basis of a latent signal is {shown(given)}: give one such as Polynomial(3) or its "
-                             "name, 'polynomial:3'")
+        raise StructureError(f"the basis of a latent signal is {short_repr(given)}: give one such as Polynomial(3) or "
+                             "its name, 'polynomial:3'")
     outside = "extrapolate" if isinstance(basis, Polynomial) else "linear"
     return replace(cast(Any, basis), interval=(-1.0, 1.0), outside=outside)

@@ -21,7 +21,7 @@ from optid.identify.arguments import outputs_present
 from optid.identify.prediction_error.descent import COMPARED, Descent, descend
 from optid.identify.prediction_error.latent_directions import MARGIN, directions
 from optid.identify.prediction_error.state_errors import StateErrors
-from optid.identify.prediction_error.state_search import entered
+from optid.identify.prediction_error.state_search import start_from_model
 from optid.models import HammersteinSS
 from optid.statistics.state_unknowns import Latent, StatePoint, beyond_affine
 
@@ -81,7 +81,7 @@ def _continued(errors: StateErrors, known: Sequence[HammersteinSS], iterations: 
     """Descend from known models with all functions, where their runs stay finite."""
     pace, found = PACE["long" if errors.data.n_samples > STAGES[0] else "short"], []
     for i, model in enumerate(known, start=1):
-        if (x := entered(errors, model)) is not None:
+        if (x := start_from_model(errors, model)) is not None:
             found.append((errors, descend(errors, x, iterations=iterations, progress=pace, start=f"start {i}"), {}))
     return [one for one in found if np.isfinite(one[1].value)]
 
@@ -136,7 +136,7 @@ def _confirmed(wider: StateErrors, x: Array, errors: StateErrors, before: Array,
     row = np.concatenate([point.Cz[-1], point.Dz[-1], point.offset_z[-1:]])
     n, outputs = fewer.unknowns.n, fewer.unknowns.l
     zero = more.unknowns.pack(_with(start, row[None], point.cs[-1:], np.zeros((n, 1)), np.zeros((outputs, 1))))
-    zero = more.normalised(zero)
+    zero = more.normalise(zero)
     found = descend(more, zero, iterations=SHORT, tolerance=COMPARED, progress=PACE["search"])
     return (found.x if found.value <= reference.value else zero), steps + found.steps
 
@@ -152,7 +152,7 @@ def _expected(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Gene
 def _added(part: StateErrors, x: Array, latent: Latent, rng: np.random.Generator, iterations: int
            ) -> tuple[StateErrors, Descent, float]:
     """Add the function of a latent signal; also return the expected gain of its best direction."""
-    x = whitened(part, x)
+    x = whiten_states(part, x)
     ranked = sorted(_ranked(part, x, latent, rng), key=lambda one: -one[0])
     ranked = [one for one, before in zip(ranked, [None, *ranked]) if before is None or one[0] < SAME * before[0]]
     ends = [one for _, *chosen in ranked[: HEATS[0][0]] if (one := _short(part, x, latent, *chosen)) is not None]
@@ -207,7 +207,7 @@ def _renewed(errors: StateErrors, x: Array, cells: int = 1) -> tuple[StateErrors
     point, known = unknowns.unpack(x), np.linspace(-1, 1, 1001)
     rows = np.hstack([point.Cz, point.Dz, point.offset_z[:, None]])
     inputs = np.vstack([e.u for e in errors.data.experiments])
-    signals = np.hstack([np.vstack(errors.visited(point)), inputs, np.ones((len(inputs), 1))])
+    signals = np.hstack([np.vstack(errors.run_states(point)), inputs, np.ones((len(inputs), 1))])
     for one, row, c in zip(unknowns.latent, rows, point.cs):
         basis: Any = one.basis
         basis = basis if cells == 1 else replace(basis, p=cells * basis.p)
@@ -231,7 +231,7 @@ def _renewed(errors: StateErrors, x: Array, cells: int = 1) -> tuple[StateErrors
                     d=point.d + linear * unknowns.feedthrough * to_output[:, n:-1],
                     offset=point.offset + C @ shift + to_output[:, -1], offset_z=point.offset_z + point.Cz @ shift)
     errors = replace(errors, unknowns=replace(unknowns, latent=tuple(finer)))
-    return errors, errors.normalised(errors.unknowns.pack(point))
+    return errors, errors.normalise(errors.unknowns.pack(point))
 
 
 def add_output_functions(errors: StateErrors, best: Descent, known: Sequence[HammersteinSS],
@@ -242,7 +242,7 @@ def add_output_functions(errors: StateErrors, best: Descent, known: Sequence[Ham
     Arguments and errors as `add_channels`; ``functions`` has one for every output.
     """
     linear, point, n = errors, errors.unknowns.unpack(best.x), errors.unknowns.n
-    signals = np.hstack([np.vstack(errors.visited(point)), np.vstack([e.u for e in errors.data.experiments])])
+    signals = np.hstack([np.vstack(errors.run_states(point)), np.vstack([e.u for e in errors.data.experiments])])
     measured, offsets, cs, rows = np.vstack([e.y for e in errors.data.experiments]), [], [], []
     for o, one in enumerate(functions):
         v = np.concatenate([point.C[o], point.d[o]])
@@ -275,17 +275,17 @@ def _idle(before: StateErrors, x: Array, after: StateErrors, found: Descent) -> 
     return {"effect of latent signals": effect}
 
 
-def whitened(errors: StateErrors, x: Array) -> Array:
+def whiten_states(errors: StateErrors, x: Array) -> Array:
     """Return the same model in states of unit covariance over the record."""
     point = errors.unknowns.unpack(x)
-    runs = errors.visited(point)
+    runs = errors.run_states(point)
     covariance = np.atleast_2d(np.cov(np.vstack(runs).T))
     values, vectors = np.linalg.eigh(covariance + 1e-9 * np.trace(covariance) * np.eye(len(covariance)))
     turn = (vectors / np.sqrt(values)).T
     back = np.linalg.inv(turn)
     moved = replace(point, A=turn @ point.A @ back, C=point.C @ back, K=turn @ point.K, b=turn @ point.b,
                     e=turn @ point.e, Ez=turn @ point.Ez, Cz=point.Cz @ back, x0=point.x0 @ turn.T)
-    return errors.normalised(errors.unknowns.pack(moved))
+    return errors.normalise(errors.unknowns.pack(moved))
 
 
 def first_samples(data: Data, size: int) -> Data:

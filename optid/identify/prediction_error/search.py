@@ -17,14 +17,14 @@ import numpy as np
 from optid.arrays import Array
 from optid.bases import Linear, fitted_bases
 from optid.data.record import Data
-from optid.data.stretches import interpolated
+from optid.data.stretches import interpolate_missing
 from optid.errors import DataWarning, OptidError, RankError
 from optid.identify.prediction_error.descent import Descent, agreement, best_of, descend, with_poles
 from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.identify.subspace.projection import project, realise
 from optid.models.layout import Layout
-from optid.models.roots import contained, roots_of, with_integrator, with_roots
+from optid.models.roots import contain_roots, roots_of, with_integrator, with_roots
 from optid.statistics.expansion import expand
 from optid.statistics.experiments import collect_by_experiment
 from optid.statistics.hankel import hankel_statistics
@@ -102,19 +102,19 @@ def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) 
     the nearest one is moved there.
     """
     if not fit.constraints:
-        return fit.signed(found[0].x)
+        return fit.with_required_signs(found[0].x)
     at, ends = criterion.unknowns.slices["a"], []
     for one in found[:ENTRIES]:
-        x = fit.signed(one.x)
+        x = fit.with_required_signs(one.x)
         first = with_integrator if criterion.integrates and criterion.unknowns.layout.na else np.array
-        moves: list[Callable[[Array], Array]] = [first, *(partial(contained, limit=radius) for radius in PULLS)]
+        moves: list[Callable[[Array], Array]] = [first, *(partial(contain_roots, limit=radius) for radius in PULLS)]
         for move in moves:
             pulled = move(x[at])
             if fit.excess(np.concatenate([pulled, x[at.stop :]]), frozenset({"a"})) <= 1e-9:
                 again = one if np.array_equal(pulled, x[at]) else with_poles(criterion, x, pulled)
                 ends.append((again.value, again.x))
                 break
-    return fit.signed(min(ends, key=lambda end: end[0])[1] if ends else found[0].x)
+    return fit.with_required_signs(min(ends, key=lambda end: end[0])[1] if ends else found[0].x)
 
 
 def starts_of(criterion: TransferErrors, number: int, seed: int) -> Iterable[tuple[str, Array]]:
@@ -153,7 +153,7 @@ def _armax_plant(plain: TransferErrors, nc: int) -> Array | None:
         return None
     states = np.zeros((unknowns.experiments, unknowns.memory))
     x = unknowns.pack(replace(armax.unknowns.unpack(x), x0=states))
-    return with_poles(plain, plain.normalised(x), contained(x[unknowns.slices["a"]], RADIUS)).x
+    return with_poles(plain, plain.normalise(x), contain_roots(x[unknowns.slices["a"]], RADIUS)).x
 
 
 def extended_least_squares(criterion: TransferErrors) -> dict[str, Array]:
@@ -192,7 +192,7 @@ def _arx(criterion: TransferErrors) -> TransferPoint:
     except RankError:
         if not any(np.isnan(e.y).any() for e in criterion.data.experiments):
             raise
-        return equation_error(replace(criterion, data=criterion.data.mapped(np.asarray, interpolated)))
+        return equation_error(replace(criterion, data=criterion.data.map_signals(np.asarray, interpolate_missing)))
 
 
 def _long_innovations(criterion: TransferErrors) -> list[Array] | None:
@@ -232,7 +232,7 @@ def arma(signals: Sequence[Array], nc: int, nd: int) -> tuple[Array, Array]:
         theta = _regression(records, [(0, i) for i in range(1, nd + 1)] + [(1, i) for i in range(1, nc + 1)])
     except RankError:
         theta = np.zeros(nd + nc)
-    return contained(theta[nd:], RADIUS), contained(-theta[:nd], RADIUS)
+    return contain_roots(theta[nd:], RADIUS), contain_roots(-theta[:nd], RADIUS)
 
 
 def _regression(records: Sequence[Array], terms: Sequence[tuple[int, int]]) -> Array:
@@ -249,7 +249,7 @@ def plant_starts(criterion: TransferErrors, seed: int) -> Iterator[tuple[str, Ar
     base = arx_start(criterion)
     yield "ARX", base.x
     for name in ("Steiglitz-McBride", "instruments"):
-        if (one := iterated(criterion, base.x, name)) is not None:
+        if (one := iterate_passes(criterion, base.x, name)) is not None:
             yield name, one.x
     if (a := _subspace(criterion.data, criterion.unknowns.layout)) is not None:
         yield "subspace", with_poles(criterion, base.x, a).x
@@ -267,8 +267,8 @@ def arx_start(criterion: TransferErrors) -> Descent:
             point = equation_error(criterion)
     except OptidError:
         point = _guess(criterion.unknowns)
-    x = criterion.normalised(criterion.unknowns.pack(point))
-    return with_poles(criterion, x, contained(point.a, RADIUS))
+    x = criterion.normalise(criterion.unknowns.pack(point))
+    return with_poles(criterion, x, contain_roots(point.a, RADIUS))
 
 
 def equation_error(criterion: TransferErrors, innovations: Sequence[Array] | None = None) -> TransferPoint:
@@ -294,10 +294,10 @@ def equation_error(criterion: TransferErrors, innovations: Sequence[Array] | Non
     c = pairs.pop() if innovations is not None else (np.ones(1), np.zeros(unknowns.nc))
     pairs = [(mu, b) if free else (np.ones(1), b * mu[0]) for free, (mu, b) in zip(unknowns.free, pairs)]
     return TransferPoint(a, tuple(mu for mu, _ in pairs), tuple(b for _, b in pairs), float(point.w[na]), x0,
-                         contained(c[0][0] * c[1], RADIUS), a)
+                         contain_roots(c[0][0] * c[1], RADIUS), a)
 
 
-def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None:
+def iterate_passes(criterion: TransferErrors, x: Array, method: str) -> Descent | None:
     """Return the best pass of "Steiglitz-McBride" or of the refined instrumental variable ("instruments").
 
     Both are Gauss-Newton steps with columns of the measured output for a: as regressors in the first case, with
@@ -320,7 +320,7 @@ def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None
         x[:p] += step
         if not np.all(np.isfinite(x)):
             break
-        found = with_poles(criterion, x, contained(x[at], 0.9999))
+        found = with_poles(criterion, x, contain_roots(x[at], 0.9999))
         settled = best is not None and abs(found.value - best.value) <= 1e-3 * best.value
         best = found if best is None or found.value < best.value else best
         if settled:
@@ -343,7 +343,7 @@ def _subspace(data: Data, layout: Layout) -> Array | None:
     except (OptidError, np.linalg.LinAlgError):
         return None
     a = with_roots(poles, layout.na)
-    return contained(a, RADIUS) if np.all(np.isfinite(a)) else None
+    return contain_roots(a, RADIUS) if np.all(np.isfinite(a)) else None
 
 
 def _guess(unknowns: TransferUnknowns) -> TransferPoint:
@@ -360,7 +360,7 @@ def _guess(unknowns: TransferUnknowns) -> TransferPoint:
 
 def _perturbed(rng: np.random.Generator, a: Array) -> Array:
     """Return coefficients of A with its poles moved at random: nearby, or anywhere in the disc in conjugate pairs."""
-    roots = roots_of(contained(a, RADIUS))
+    roots = roots_of(contain_roots(a, RADIUS))
     if rng.random() < 0.5:
         upper = roots[np.imag(roots) >= 0]
         radius = 1 - np.clip((1 - np.abs(upper)) * np.exp(rng.normal(0, 1.0, upper.size)), 1 - RADIUS, 1.0)

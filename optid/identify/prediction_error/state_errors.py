@@ -26,7 +26,7 @@ from optid.models import state_simulation as simulation
 from optid.models.roots import spectral_radius
 from optid.models.state_signals import Stretch
 from optid.program.units import outer_bases
-from optid.statistics.linearised import Linearised, Method, linearised
+from optid.statistics.linearised import Linearised, Method, linearise_errors
 from optid.statistics.state_unknowns import SIMULATORS, StatePoint, StateUnknowns
 
 STABLE = 1 - 1e-9
@@ -91,7 +91,7 @@ class StateErrors(Criterion):
         """Return the errors near x; of infinite value where a run leaves the range allowed."""
         n, p, experiments = self.unknowns.memory, self.unknowns.shared, self.unknowns.experiments
         try:
-            return linearised(self.rows(x), experiments, n, p, self.gauge_rows(x), method)
+            return linearise_errors(self.rows(x), experiments, n, p, self.gauge_rows(x), method)
         except (FloatingPointError, DataError):
             nothing = (np.eye(n), np.zeros((n, p)), np.zeros(n))
             return Linearised(np.eye(p), np.zeros(p), (nothing,) * experiments, np.inf, 0, 1.0, "gram")
@@ -102,7 +102,7 @@ class StateErrors(Criterion):
         point, model = self._placed(x)
         chunk = max(32, NUMBERS // ((unknowns.memory + unknowns.shared + 1) * unknowns.l))
 
-        def weighted(index: int) -> Iterator[tuple[Array, int]]:
+        def weighted_blocks(index: int) -> Iterator[tuple[Array, int]]:
             for block in _runs(self._job(model, index), unknowns, point, index, chunk):
                 count = int(np.count_nonzero(~np.isnan(block[:, :, -1])))
                 block = _weighted(block, covariance)
@@ -110,7 +110,7 @@ class StateErrors(Criterion):
                     raise FloatingPointError
                 yield block.reshape(-1, block.shape[2]), count
 
-        return weighted
+        return weighted_blocks
 
     def admissible(self, x: Array) -> bool:
         """Whether the matrix that carries the state is stable enough, and the constraints on poles hold."""
@@ -151,14 +151,14 @@ class StateErrors(Criterion):
         point, model = self._placed(x)
         return [simulation.run(self._job(model, i), point.x0[i]) - e.y for i, e in enumerate(self.data.experiments)]
 
-    def visited(self, point: StatePoint) -> list[Array]:
+    def run_states(self, point: StatePoint) -> list[Array]:
         """Return the states (N, n) of the run of every experiment, whatever its range."""
         _, model = self._placed(self.unknowns.pack(point))
-        return [simulation.visited(self._job(model, i, within=False), x0) for i, x0 in enumerate(point.x0)]
+        return [simulation.run_states(self._job(model, i, within=False), x0) for i, x0 in enumerate(point.x0)]
 
     def _job(self, model: HammersteinSS, index: int, within: bool = True) -> simulation.Run:
         e, limits = self.data.experiments[index], self.limits[index] if within and self.limits else None
-        return simulation.prepared(model, SIMULATORS[self.unknowns.criterion], e.u, e.y, limits, "")
+        return simulation.prepare_run(model, SIMULATORS[self.unknowns.criterion], e.u, e.y, limits, "")
 
     def output_weights(self, i: int) -> sp.csr_array:
         """Return the matrix that weighs the outputs of an experiment, column by column, as far as they are present."""
@@ -170,7 +170,7 @@ class StateErrors(Criterion):
             blocks.append(sp.kron(weight_root(covariance, ~pattern)[there], picked))
         return sp.csr_array(sp.vstack(blocks))
 
-    def reweighted(self, x: Array, full: bool) -> "StateErrors":
+    def reweight(self, x: Array, full: bool) -> "StateErrors":
         """Return the criterion weighted by the inverse (co)variance of the errors at x.
 
         A fixed point is stationary for the determinant of the covariance (``full``), or the product of the variances.
@@ -199,8 +199,8 @@ class StateErrors(Criterion):
                             f"their variance, so that they cannot be weighted: {remedy}")
 
     def level(self, x: Array, full: bool = False) -> float:
-        """Return the log determinant that `reweighted` lowers, which compares points of different weights."""
-        return -float(np.linalg.slogdet(self.reweighted(x, full).weight)[1])
+        """Return the log determinant that `reweight` lowers, which compares points of different weights."""
+        return -float(np.linalg.slogdet(self.reweight(x, full).weight)[1])
 
     def _placed(self, x: Array) -> tuple[StatePoint, HammersteinSS]:
         """Return the point and the model at x; the last ones are kept, since every step asks twice."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from optid.arrays import Array, check_integer, one_of
 from optid.core.problem import Problem
-from optid.data.levels import levelled
+from optid.data.levels import remove_levels
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
@@ -21,7 +21,7 @@ from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.state_search import complete, errors_and_starts, on_whole, quietly, search_states
 from optid.identify.prediction_error.tangent_descent import refine
 from optid.identify.prediction_error.tangent_fit import TangentFit
-from optid.identify.subspace.plan import Plan, in_record_units, planned
+from optid.identify.subspace.plan import Plan, in_record_units, make_plan
 from optid.identify.subspace.procedure import SubspaceSteps
 from optid.models import HammersteinSS
 from optid.program.solution import Status
@@ -58,7 +58,7 @@ def fit_states(name: str, data: Data, nx: int | str, *, pose: Pose, subspace: Su
             raise StructureError(f"{name} with feedback, latent functions or states as variables has one constant for "
                                  "all experiments: offset='each' is for 'ss.exact' and 'hammerstein_ss.exact' without "
                                  "feedback, and for transfer functions")
-        data = levelled(record)[0]
+        data = remove_levels(record)[0]
     instruments = "inputs+past" if feedback_basis is None else "simulated"
     if feedback_basis is not None and criterion == "prediction":
         instruments = "simulated+past"
@@ -67,7 +67,7 @@ def fit_states(name: str, data: Data, nx: int | str, *, pose: Pose, subspace: Su
         if getattr(rule, "verify", None) is None:
             raise StructureError(f"constraint {rule.name!r} cannot judge a model, which the steps of this fit need; "
                                  "use it with hammerstein_ss.asivid")
-    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis,
+    plan = make_plan(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis,
                    offset=bool(constants), instruments=instruments, feedthrough=feedthrough, stability="free",
                    iterations=2 * (feedback_basis is not None), constraints=poles)
     models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
@@ -100,7 +100,7 @@ def _refined(pose: Pose, plan: Plan, errors: StateErrors, constraints: tuple[Any
              figures: Mapping[str, Any]) -> Procedure:
     problem = pose(plan.name, errors, best.x, constraints)
     fit = TangentFit(problem, errors, partial(CompressedStates, errors))
-    return (yield from refine(fit, best, figures, fit.signed(best.x)))
+    return (yield from refine(fit, best, figures, fit.with_required_signs(best.x)))
 
 
 def _block_rows(plan: Plan) -> list[int | None]:
@@ -132,7 +132,7 @@ def _subspace_starts(subspace: SubspaceSteps, plan: Plan, block_rows: Sequence[i
             return evidence
         if evidence.model is not None:
             nx = nx or int(evidence.figures["order"])
-            model = evidence.extended()[0] if predicts else evidence.model  # K counts there
+            model = evidence.run_extension()[0] if predicts else evidence.model  # K counts there
             found[f"{evidence.figures['block rows']} block rows"] = model
     if nx is None or not found:
         raise refusal or RankError("no subspace fit has a point to start from; use another order")

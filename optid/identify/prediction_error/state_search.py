@@ -9,7 +9,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.certificate.hankel import simulation_bound
-from optid.data.levels import levelled
+from optid.data.levels import remove_levels
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import DataError, DataWarning, RankError, StructureError
@@ -18,7 +18,7 @@ from optid.identify.noise import with_noise
 from optid.identify.prediction_error.descent import AGREE, STEPS, Descent, best_of, descend
 from optid.identify.prediction_error.state_errors import STABLE, WILD, StateErrors
 from optid.identify.subspace.plan import Plan
-from optid.identify.validation.predictions import one_step, simulated, simulated_or_nan
+from optid.identify.validation.predictions import one_step, simulate_outputs, simulated_or_nan
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.roots import spectral_radius
 from optid.models.state_simulation import allowed_range
@@ -79,7 +79,7 @@ def _weighted(errors: StateErrors, start: str, x: Array, weighting: str, iterati
               ) -> tuple[StateErrors, Descent]:
     """Descend and weight the errors by their own (co)variance until it converges; add the steps taken before."""
     for _ in range(ROUNDS):
-        new = errors if weighting == "scale" else errors.reweighted(x, full=weighting == "determinant")
+        new = errors if weighting == "scale" else errors.reweight(x, full=weighting == "determinant")
         change = np.linalg.norm(new.weight - errors.weight) / np.linalg.norm(new.weight)
         errors = new
         one = descend(errors, x, iterations=iterations, start=start)
@@ -89,7 +89,7 @@ def _weighted(errors: StateErrors, start: str, x: Array, weighting: str, iterati
     return errors, replace(one, steps=steps)
 
 
-def entered(errors: StateErrors, model: HammersteinSS) -> Array | None:
+def start_from_model(errors: StateErrors, model: HammersteinSS) -> Array | None:
     """Return an admissible vector of unknowns near a model, contracted where it is unstable, with fitted states.
 
     None where no contraction is admissible.
@@ -99,7 +99,7 @@ def entered(errors: StateErrors, model: HammersteinSS) -> Array | None:
     candidates = [point, *([replace(point, K=still)] if errors.unknowns.innovations else []),
                   *(replace(point, A=point.A * (radius / max(largest, radius)), K=still) for radius in RADII)]
     for candidate in candidates:
-        x = errors.normalised(errors.unknowns.pack(candidate))
+        x = errors.normalise(errors.unknowns.pack(candidate))
         if not errors.admissible(x):
             continue
         try:
@@ -116,12 +116,12 @@ def entered(errors: StateErrors, model: HammersteinSS) -> Array | None:
 def _balanced(errors: StateErrors, model: HammersteinSS) -> HammersteinSS:
     """Balance the states, if possible, for the signals and weights of the fit."""
     data = errors.data
-    f = model.expanded(np.vstack([e.u for e in data.experiments]))
+    f = model.expand_inputs(np.vstack([e.u for e in data.experiments]))
     y = np.vstack([e.y for e in data.experiments])
     g = [np.nanstd(function(y[:, o])) for function, o in zip(model.feedback, model.output_of)]
     driven = np.hstack([model.B * f.std(axis=0), model.E * np.array(g)])
     try:
-        return model.transformed(balancing(model.A, driven, np.linalg.cholesky(errors.weight).T @ model.C))
+        return model.transform(balancing(model.A, driven, np.linalg.cholesky(errors.weight).T @ model.C))
     except StructureError:
         return model
 
@@ -169,7 +169,7 @@ def _with_noise(model: HammersteinSS, errors: StateErrors) -> tuple[HammersteinS
         if not errors.unknowns.innovations and not errors.unknowns.latent:
             return with_noise(model, data), {}
         # errors without a fitted gain count as white: with latent functions the optimal gain depends on the state
-        found = one_step(model, data) if errors.unknowns.innovations else simulated(model, data)
+        found = one_step(model, data) if errors.unknowns.innovations else simulate_outputs(model, data)
         rest = np.vstack([e.y for e in data.experiments]) - np.vstack(found)
         rest = rest[~np.isnan(rest).any(axis=1)]
         covariance = rest.T @ rest / max(len(rest), 1)
@@ -199,7 +199,7 @@ def on_whole(errors: StateErrors, best: Descent, data: Data) -> tuple[StateError
     if data.n_experiments == errors.unknowns.experiments:
         return replace(errors, data=data), best
     whole = replace(errors, data=data, unknowns=replace(errors.unknowns, experiments=data.n_experiments))
-    x = entered(whole, errors.at(errors.unknowns.unpack(best.x)))
+    x = start_from_model(whole, errors.at(errors.unknowns.unpack(best.x)))
     if x is None:
         raise RankError("the model of the first samples has no finite run on the rest of the record")
     return whole, replace(best, x=x)
@@ -213,7 +213,7 @@ def errors_and_starts(plan: Plan, nx: int, found: dict[str, HammersteinSS], crit
     """
     data, shifts = with_whole_inputs(plan.data if several is None else several, 2 * nx + 1), None
     if several is not None:
-        data, shifts = levelled(data)
+        data, shifts = remove_levels(data)
     unknowns = StateUnknowns(nx, plan.expansion(), data.n_experiments, plan.direct(), criterion,
                              plan.offset and shifts is None, levels=shifts is not None)
     # a similarity transformation removes nx² degrees of freedom
@@ -221,7 +221,7 @@ def errors_and_starts(plan: Plan, nx: int, found: dict[str, HammersteinSS], crit
     variances = np.nanvar(np.vstack([e.y for e in data.experiments]), axis=0)
     errors = StateErrors(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)), plan.units,
                          STABLE if stability == "stable" else np.inf, checks, shifts)
-    starts = {name: x for name, model in found.items() if (x := entered(errors, model)) is not None}
+    starts = {name: x for name, model in found.items() if (x := start_from_model(errors, model)) is not None}
     if not starts:
         raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")
     return errors, starts

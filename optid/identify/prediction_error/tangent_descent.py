@@ -16,7 +16,14 @@ import numpy as np
 from optid.arrays import Array
 from optid.core.program import Program
 from optid.errors import RankError, StructureError
-from optid.identify.prediction_error.border import about_poles, along_border, doubled, meet, poles_of, slowed
+from optid.identify.prediction_error.border import (
+    about_poles,
+    along_border,
+    meet,
+    poles_of,
+    with_double_pole,
+    with_slow_poles,
+)
 from optid.identify.prediction_error.curvature import Curvature, measure_curvature
 from optid.identify.prediction_error.descent import STEPS, Descent
 from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
@@ -78,7 +85,7 @@ def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array
     solution = yield here.program
     if not solution.has_point:
         return None
-    verdict = here.judged(solution, CONFIRMED) if found.converged else (Status.LIMIT, found.reason)
+    verdict = here.judge(solution, CONFIRMED) if found.converged else (Status.LIMIT, found.reason)
     return here.evidence(*verdict, {**figures, "programmes": 1})
 
 
@@ -98,7 +105,8 @@ def _settled(fit: TangentFit, end: Evidence, figures: Mapping[str, Any], easy: b
         if depth is not None:
             best = along_border(fit.criterion, depth, before, ALONG, alone)
             if not alone:
-                best = yield from _beside_others(fit, before, (doubled(fit.criterion, depth, before), best), figures)
+                best = yield from _beside_others(fit, before, (with_double_pole(fit.criterion, depth, before), best),
+                                                 figures)
                 tried = True
         on_border = best is not before
         if not on_border and end.status is Status.LOCAL and not (easy and depth is None):
@@ -146,7 +154,7 @@ def _along_valley(fit: TangentFit, x: Array) -> Generator[Program, Solution, Arr
         while new is None and damping <= 1.0:
             solution = yield fit.pose(here.x, at, damping)
             if solution.has_point:
-                gain, new = here.gain(step := here.step(solution), at), here.moved(here.x + step)
+                gain, new = here.gain(step := here.step(solution), at), here.move_to(here.x + step)
                 damping = damping if gain > ALONG * here.at.value else np.inf
                 if new is not None and (new.outside > INSIDE or not here.at.value - new.at.value >= 0.1 * gain > 0):
                     new = None
@@ -191,16 +199,16 @@ class _Iterate:
 
     @classmethod
     def of(cls, fit: TangentFit, x: Array) -> "_Iterate":
-        x = fit.criterion.normalised(x)
+        x = fit.criterion.normalise(x)
         at = fit.criterion.linearise(x)
         outside = fit.excess(x) if fit.constraints else 0.0
         amount = fit.problem.violation(fit.places.values(x)) if outside > NOWHERE else 0.0
         return cls(fit, x, at, fit.pose(x, at, 0.0), outside, amount)
 
-    def moved(self, x: Array) -> "_Iterate | None":
+    def move_to(self, x: Array) -> "_Iterate | None":
         """Return the iterate at x, None where it is inadmissible, its run explodes or its gauge cannot be reached."""
         criterion = self.fit.criterion
-        x = criterion.confined(x)
+        x = criterion.confine(x)
         try:
             return _Iterate.of(self.fit, x) if criterion.admissible(x) and np.isfinite(criterion.value(x)) else None
         except StructureError:
@@ -220,7 +228,7 @@ class _Iterate:
     def negligible(self, gain: float, share: float) -> bool:
         return abs(gain) <= share * self.at.value + ROUNDING * self.fit.criterion.energy
 
-    def judged(self, solution: Solution, share: float) -> tuple[Status, str]:
+    def judge(self, solution: Solution, share: float) -> tuple[Status, str]:
         """What an answer to the programme makes of the iterate: it must have been solved, and the iterate stay."""
         if solution.status not in (Status.OPTIMAL, Status.LOCAL) and not _near(solution):
             return solution.status, solution.reason
@@ -234,7 +242,7 @@ class _Iterate:
         bound = Bound.none(NO_BOUND.format(self.fit.criterion.errors))
         values, value = self.fit.places.values(self.x), self.fit.criterion.unit * self.at.value
         model, turns = self.fit.recover(values), self.fit.turns(self.x) if self.fit.constraints else np.ones(1)
-        model = model.turned(turns) if np.any(turns < 0) else model
+        model = model.with_signs(turns) if np.any(turns < 0) else model
         return Evidence(model, value, bound, status, reason, figures, values=values)
 
 
@@ -249,14 +257,14 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
     if best is not None and best.objective <= free * (1 + CONFLICT):
         return best
     known = about_poles(fit.constraints) or fit.criterion.dynamics not in fit.criterion.unknowns.slices
-    slow = [] if known else slowed(fit.criterion, here.x)
+    slow = [] if known else with_slow_poles(fit.criterion, here.x)
     held = []
     for x in () if known else (here.x, *slow):
         end = yield from _with_poles(fit, x, fit.constraints, figures)
         held += [] if end is None else [fit.places.pack(end.values or {})]
     best = yield from _gone_on(fit, best, figures)
-    slow_ones = [start for x in slow for start in (x, *fit.mirrored(x, same=True))]
-    for start in (*fit.mirrored(here.x, same=True), *fit.mirrored(here.x), *slow_ones, *held):
+    slow_ones = [start for x in slow for start in (x, *fit.sign_variants(x, same=True))]
+    for start in (*fit.sign_variants(here.x, same=True), *fit.sign_variants(here.x), *slow_ones, *held):
         end = yield from _constrained(_Iterate.of(fit, start), figures, SIGNED)
         if end is None or best is not None and not end.objective < best.objective * (1 + CONFLICT):
             continue
@@ -296,7 +304,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) 
     answered, curvature, since = False, Curvature(here.x.size), here.at.value
     entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
     for count in range(1, most + 1):
-        at = curvature.added(here.at) if curvature.used else here.at
+        at = curvature.add_to(here.at) if curvature.used else here.at
         plain = at is here.at and not damping
         solution = yield here.program if plain else here.fit.pose(here.x, at, damping)
         if not solution.has_point and at is not here.at:
@@ -313,7 +321,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) 
             damping = max(100.0 * damping, 1e-6)  # a nearer point, and a better conditioned programme
             continue
         answered, step = True, here.step(solution)
-        gain, new = here.gain(step, at), here.moved(here.x + step)
+        gain, new = here.gain(step, at), here.move_to(here.x + step)
         duals = [solution.duals[name] for name in here.program.user_constraints if name in solution.duals]
         needed = max((2.0 * float(np.max(np.abs(dual), initial=0.0)) for dual in duals), default=0.0)
         weight = max(needed, (weight + needed) / 2)  # multipliers far from the constraints may be huge
@@ -324,7 +332,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) 
         last = abs(gain) if plain else last
         if plain and here.negligible(gain, share) and here.outside <= INSIDE:
             best = here if new is None or new.outside > INSIDE or new.at.value > here.at.value else new
-            return best.evidence(*here.judged(solution, share), {**figures, "programmes": count + more})
+            return best.evidence(*here.judge(solution, share), {**figures, "programmes": count + more})
         expected = gain + weight * here.amount
         fall = here.merit(weight) - new.merit(weight) if new is not None else -np.inf
         entering = new is not None and not entered and (
@@ -341,7 +349,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) 
         elif at is not here.at:
             curvature.used = False
         elif plain and here.negligible(gain, BETTER) and here.outside <= INSIDE:  # little, and it does not come
-            return here.evidence(*here.judged(solution, BETTER), {**figures, "programmes": count + more})
+            return here.evidence(*here.judge(solution, BETTER), {**figures, "programmes": count + more})
         else:
             damping, growth = max(growth * damping, 1e-7), 2.0 * growth
             if damping > 1e10:
@@ -361,7 +369,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) 
 def _longer(here: _Iterate, new: _Iterate, step: Array, weight: float) -> _Iterate:
     """Go on along a step that gained more than its programme promised, as on a boundary that is curved inwards."""
     for factor in 2.0 ** np.arange(1, PARTS + 1):
-        further = here.moved(here.x + factor * step)
+        further = here.move_to(here.x + factor * step)
         if further is None or further.merit(weight) >= new.merit(weight):
             break
         new = further
@@ -378,7 +386,7 @@ def _shortened(here: _Iterate, weight: float) -> Generator[Program, Solution, _I
         return None
     step = here.step(solution)
     for part in 0.5 ** np.arange(1, PARTS + 1):
-        new, gain = here.moved(here.x + part * step), here.gain(part * step)
+        new, gain = here.move_to(here.x + part * step), here.gain(part * step)
         if new is not None and gain > 0 and here.merit(weight) - new.merit(weight) >= 1e-3 * gain:
             return new
     return None
@@ -388,7 +396,7 @@ def _ended(here: _Iterate, reason: str, last: float, figures: Mapping[str, Any])
     """Judge where the iteration stopped by one more undamped programme."""
     solution = yield here.program
     if solution.has_point and here.outside <= INSIDE and here.negligible(here.gain(here.step(solution)), STALLED):
-        return here.evidence(*here.judged(solution, STALLED), figures)
+        return here.evidence(*here.judge(solution, STALLED), figures)
     reason = f"{reason}; the last undamped one promised {last / here.at.value:.0e} of the value"
     return here.evidence(Status.LIMIT, reason, figures)
 

@@ -67,11 +67,11 @@ class TangentFit:
         """The named unknowns in the order of their vector."""
         return self.criterion.variables
 
-    def signed(self, x: Array) -> Array:
+    def with_required_signs(self, x: Array) -> Array:
         """Return x with the signs of mu and b that the constraints ask for."""
         return with_signs(self.criterion, x, self.excess if self.constraints else None)
 
-    def mirrored(self, x: Array, same: bool = False) -> Iterator[Array]:
+    def sign_variants(self, x: Array, same: bool = False) -> Iterator[Array]:
         """Yield x with other pairs of signs of mu and b of every input, of the same function or of its negative.
 
         What a word says of f may be nearer to one of them, and its optimum to another: f may be convex either way. Two
@@ -106,7 +106,7 @@ def with_signs(criterion: Criterion, x: Array, excess: Callable[[Array], float] 
     A monotone f or a sign of the gain says which of the two equal descriptions is meant; where it asks for the opposite
     characteristic, mu or b alone is turned, since no tangent step leads through zero.
     """
-    x, at = criterion.normalised(x), criterion.unknowns.slices
+    x, at = criterion.normalise(x), criterion.unknowns.slices
     for mu, b in criterion.unknowns.products if criterion.gauge == "norm" else ():
         if mu.startswith("nu"):  # the signs of feedback functions stay
             continue

@@ -9,7 +9,7 @@ import numpy as np
 from optid.arrays import Array, check_integer
 from optid.bases import Linear, fitted_bases
 from optid.data.channels import Transform, model_meta
-from optid.data.levels import levelled
+from optid.data.levels import remove_levels
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.identify.arguments import Offset, check_offset, enough_rows, one_output, outputs_present, per_channel
@@ -71,7 +71,7 @@ class TransferErrors(TransferPredictor, Criterion):
             nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(layout.bases, mus)), nk=layout.nk,
             offset=part.get("offset", np.zeros(1)), levels=levels, gauge=self.gauge, c=part.get("c", np.zeros(0)),
             d=part.get("d", np.zeros(0)) if self.unknowns.apart else None, **model_meta(self.data))
-        model = model if signed else model.turned(model.gain_signs)
+        model = model if signed else model.with_signs(model.gain_signs)
         if self.shifts is not None:
             model = model.with_output_levels(self.shifts)
         return model.with_transform(self.units)
@@ -110,16 +110,16 @@ class TransferErrors(TransferPredictor, Criterion):
             a = roots.without_integrator(a)
         return not self.unknowns.apart or roots.radius(a) < STABLE
 
-    def confined(self, x: Array) -> Array:
+    def confine(self, x: Array) -> Array:
         """Return x with the zeros of C inside the unit circle, on which those of noise without a level lie."""
         x, at = np.array(x), self.unknowns.slices["c"]
         if np.all(np.isfinite(x)) and roots.radius(x[at]) >= STABLE:
-            x[at] = roots.contained(x[at], CONFINED)
+            x[at] = roots.contain_roots(x[at], CONFINED)
         return x
 
-    def normalised(self, x: Array) -> Array:
+    def normalise(self, x: Array) -> Array:
         """Return the same model in the gauge; a pole that a constraint puts at 1 lies there to the last digit."""
-        x, at = super().normalised(x), self.unknowns.slices["a"]
+        x, at = super().normalise(x), self.unknowns.slices["a"]
         rest = 1 + x[at].sum()
         if self.integrates and abs(rest) <= INTEGRATES:
             x[at.stop - 1] -= rest
@@ -189,7 +189,7 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
         check_lengths([e.n_samples for e in data.experiments], layout)
         data = with_whole_inputs(data, 2 * layout.first_row + 1)
     if constants == "each":
-        data, shifts = levelled(data)
+        data, shifts = remove_levels(data)
     bases = fitted_bases(data, basis)
     units = own_units(data, [isinstance(one, Linear) for one in bases], bool(constants))
     record, layout = in_units(data, units), replace(layout, bases=tuple(inner_bases(bases, units)))

@@ -33,5 +33,5 @@ def fit_transfer(errors: TransferErrors, starts: int, seed: int, pose: Callable[
     free = errors if errors.gauge == "none" else replace(errors, gauge="norm")
     best, others, figures = search(free, lambda part: starts_of(part, starts, seed))
     enough_rows(best.at.rows, errors.errors, errors.unknowns.size, "lags")
-    fit = TangentFit(pose(errors.normalised(best.x)), errors, partial(CompressedErrors, errors))
+    fit = TangentFit(pose(errors.normalise(best.x)), errors, partial(CompressedErrors, errors))
     return (yield from refine(fit, best, figures, entry(fit, free, [best, *others])))

@@ -30,7 +30,7 @@ from optid.models.process import ProcessModel
 from optid.models.process_dynamics import ProcessDynamics, thin_out
 from optid.program.compressed import Spread
 from optid.program.units import energy_unit, outer_bases
-from optid.statistics.linearised import Linearised, Method, linearised
+from optid.statistics.linearised import Linearised, Method, linearise_errors
 
 STEP = 1e-6  # of the differences by which the free motion follows the poles
 AT_KINK = 1e-9  # samples between a dead time and a kink up to which it lies there
@@ -309,7 +309,7 @@ class ProcessErrors(Criterion):
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x."""
         u = self.unknowns
-        return linearised(self.rows(x), u.experiments, u.n, u.shared, method=method)
+        return linearise_errors(self.rows(x), u.experiments, u.n, u.shared, method=method)
 
     def compress(self, at: Linearised, reference: Array) -> CompressedErrors:
         """Return the compressed errors near a point."""

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array, check_integer, one_of
 from optid.bases import fitted_bases, from_dict, parse
 from optid.bases.basis import Basis
-from optid.data.channels import channel_fields, listed, sampling_time
+from optid.data.channels import as_name_list, channel_fields, sampling_time
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, RankError, StructureError
@@ -123,7 +123,7 @@ class RecursiveARX(SavedState):
             StructureError: invalid orders, a basis without interval, a forgetting factor outside (0, 1], a P0 that is
                 not positive.
         """
-        names_u, names_y = listed(inputs) or [], listed(outputs) or []
+        names_u, names_y = as_name_list(inputs) or [], as_name_list(outputs) or []
         m = len(names_u)
         bases = tuple(parse(b) if isinstance(b, str) else b for b in _each(basis, m))
         self.layout = Layout(na, _each(nb, m), _each(nk, m), bases, tuple(names_y), tuple(names_u))

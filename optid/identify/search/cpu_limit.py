@@ -30,7 +30,7 @@ def cpu_limit(seconds: float) -> Iterator[None]:
     def over(*_: Any) -> None:
         raise OutOfTime
 
-    def ignored(args: "sys.UnraisableHookArgs") -> None:
+    def ignore(args: "sys.UnraisableHookArgs") -> None:
         if isinstance(args.exc_value, OutOfTime):
             signal.setitimer(timer, MOMENT)
         else:
@@ -38,7 +38,7 @@ def cpu_limit(seconds: float) -> Iterator[None]:
 
     hook = sys.unraisablehook
     before = signal.signal(signal.SIGPROF, over)
-    sys.unraisablehook = ignored
+    sys.unraisablehook = ignore
     signal.setitimer(timer, seconds)
     try:
         yield

@@ -37,7 +37,7 @@ def _determined(word: str, runs: list[Array]) -> str:
     if np.unique(u).size <= 2:
         return LINE
     for count in range(int(size), 1, -1):
-        basis = parse(f"{family}:{count}").fitted(float(u.min()), float(u.max()))
+        basis = parse(f"{family}:{count}").with_interval(float(u.min()), float(u.max()))
         values = [basis.values(run) for run in runs if run.size]
         changes = np.vstack([one - one.mean(axis=0) for one in values])
         if np.linalg.svd(changes, compute_uv=False)[-1] ** 2 >= FEWEST:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import LARGEST, is_number, shown
+from optid.arrays import LARGEST, is_number, short_repr
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.search.trial import StructureCandidate
@@ -33,7 +33,8 @@ def effort_of(given: Any) -> float:
         with suppress(ValueError):
             value = EFFORTS[given] if given in EFFORTS else float(given)
     if not is_number(value) or not 0 < value <= LARGEST:
-        raise StructureError(f"effort={shown(given)}: use one of {', '.join(EFFORTS)}, or a number of units above 0")
+        raise StructureError(f"effort={short_repr(given)}: use one of {', '.join(EFFORTS)}, "
+                             "or a number of units above 0")
     return float(value)
 
 

@@ -41,7 +41,7 @@ class KeptTrials:
                             "another file")
         self._known = dict(trials)
 
-    def known(self, candidate: StructureCandidate, rival: Trial | None) -> Trial | None:
+    def find_trial(self, candidate: StructureCandidate, rival: Trial | None) -> Trial | None:
         """Return the trial of a candidate against a rival, if it was finished; it takes no more time."""
         found = self._known.get(_key(candidate, rival))
         return None if found is None else replace(found, candidate=candidate, seconds=0.0)

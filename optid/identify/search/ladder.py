@@ -78,7 +78,7 @@ class Ladder:
         return cls(data, len(blocks.moving), told, delays, regressions, {},
                    _levels_of(data, delays[-1]) if several else None)
 
-    def levelled(self, candidate: StructureCandidate) -> StructureCandidate:
+    def with_levels(self, candidate: StructureCandidate) -> StructureCandidate:
         """Return a candidate with a level for every experiment, where the record has them and the method knows them."""
         if not self.levels_differ or candidate.kind in (FEEDBACK, LATENT) or candidate.formulation in ONE_LEVEL:
             return candidate
@@ -161,7 +161,7 @@ class Ladder:
                    default=2)
 
 
-def climbed(candidates: Iterable[list[StructureCandidate]]) -> Rung:
+def climb(candidates: Iterable[list[StructureCandidate]]) -> Rung:
     """Try one batch after another until two in a row bring no improvement: of the score, or without one of the fit."""
     best, failed = (False, -np.inf), 0
     for batch in candidates:
@@ -192,15 +192,15 @@ def linear_models(ladder: Ladder) -> Rung:
     if not ladder.open:  # others assume that the input does not depend on the noise
         yield from _in_a_loop(ladder)
         return
-    yield from climbed([model("hammerstein_ss.sid", nx=n, basis="linear")] for n in range(1, LARGEST + 1))
+    yield from climb([model("hammerstein_ss.sid", nx=n, basis="linear")] for n in range(1, LARGEST + 1))
     if not ladder.single:
         n = int(ladder.arguments(LINEAR, "hammerstein_ss.sid").get("nx", 2))
         yield [model("ss.exact", nx=k) for k in dict.fromkeys([n, 2])]
-        yield from climbed([model("ss.exact", nx=k)] for k in range(n + 1, min(n + 3, LARGEST) + 1))
+        yield from climb([model("ss.exact", nx=k)] for k in range(n + 1, min(n + 3, LARGEST) + 1))
         # free runs leave coloured errors whose weight a noise model would lower
-        yield from climbed([model("ss.exact", nx=k, criterion="prediction")] for k in range(2, LARGEST + 1))
+        yield from climb([model("ss.exact", nx=k, criterion="prediction")] for k in range(2, LARGEST + 1))
         return
-    yield from climbed([model("oe.exact", na=n, nb=n, nk=list(ladder.delays[-1]))] for n in range(1, 8))
+    yield from climb([model("oe.exact", na=n, nb=n, nk=list(ladder.delays[-1]))] for n in range(1, 8))
     if a := ladder.arguments(LINEAR, "oe.exact"):  # fewer zeros, and other delays
         n = a["na"]
         yield [*(model("oe.exact", na=n, nb=nb, nk=list(a["nk"])) for nb in dict.fromkeys([1, max(n - 1, 1), n + 2])),
@@ -264,10 +264,10 @@ def _in_a_loop(ladder: Ladder) -> Rung:
     model = partial(structure, LINEAR)
     if ladder.single:
         delay = list(ladder.delays[-1])
-        yield from climbed([model("bj.exact", na=n, nb=n, nk=delay, nc=1, nd=1),
+        yield from climb([model("bj.exact", na=n, nb=n, nk=delay, nc=1, nd=1),
                             model("armax.exact", na=n, nb=n, nk=delay, nc=n)] for n in range(1, 5))
     else:
-        yield from climbed([model("ss.exact", nx=n, criterion="prediction", feedthrough=False)]
+        yield from climb([model("ss.exact", nx=n, criterion="prediction", feedthrough=False)]
                            for n in range(1, LARGEST + 1))
 
 
@@ -298,7 +298,7 @@ def input_functions(ladder: Ladder) -> Rung:
     if not (a := ladder.arguments(INPUTS)):
         return
     if ladder.promising(INPUTS):
-        yield from climbed([model(k, a["nk"], a["basis"])] for k in range(a["na"] + 1, 7))
+        yield from climb([model(k, a["nk"], a["basis"])] for k in range(a["na"] + 1, 7))
     a = ladder.arguments(INPUTS)
     yield [model(a["na"], a["nk"], ladder.bases(word))
            for word in ("polynomial:2", "polynomial:5", "triangular:4", "triangular:10")]
@@ -316,11 +316,11 @@ def _of_several_outputs(ladder: Ladder, words: Sequence[Any]) -> Rung:
     order = ladder.order()
     yield [subspace(nx=order, basis=word) for word in words]
     a = ladder.arguments(INPUTS) or {"basis": words[0]}
-    yield from climbed([subspace(nx=k, basis=a["basis"])] for k in range(order + 1, LARGEST + 1))
+    yield from climb([subspace(nx=k, basis=a["basis"])] for k in range(order + 1, LARGEST + 1))
     a = ladder.arguments(INPUTS) or {"nx": order, **a}
     yield [states(nx=k, basis=a["basis"]) for k in dict.fromkeys([a["nx"], order, 2])]
     if a := ladder.arguments(INPUTS, "hammerstein_ss.exact"):
-        yield from climbed([states(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
+        yield from climb([states(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
         linear = ladder.arguments(LINEAR)
         if linear.get("criterion") == "prediction":
             yield [states(nx=linear["nx"], basis=a["basis"], criterion="prediction")]
@@ -336,7 +336,7 @@ def feedback(ladder: Ladder) -> Rung:
            for word in ("polynomial:2", "polynomial:4", "triangular:6")]
     a = ladder.arguments(FEEDBACK)
     if ladder.promising(FEEDBACK):
-        yield from climbed([model(nx=n, basis=a["basis"], feedback_basis=a["feedback_basis"])]
+        yield from climb([model(nx=n, basis=a["basis"], feedback_basis=a["feedback_basis"])]
                            for n in range(a["nx"] + 1, 7))
 
 
@@ -415,7 +415,7 @@ def _output_functions(ladder: Ladder) -> Rung:
             yield [model(**{**a, "basis": word}) for word in inner if word != a["basis"]]
         if ladder.promising(LATENT, *words):
             a = ladder.arguments(LATENT, leading.candidate.formulation)
-            yield from climbed([model(**{**a, "nx": n})] for n in range(a["nx"] + 1, MOST_LATENT + 1))
+            yield from climb([model(**{**a, "nx": n})] for n in range(a["nx"] + 1, MOST_LATENT + 1))
 
 
 RUNGS: dict[str, Callable[[Ladder], Rung]] = {

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import LARGEST, check_integer, is_number, one_of, shown
+from optid.arrays import LARGEST, check_integer, is_number, one_of, short_repr
 from optid.backends.back_end import Settings
 from optid.data.record import Data, not_a_record
 from optid.data.reduction import available_cores
@@ -35,9 +35,9 @@ from optid.identify.search.trial import (
     StructureCandidate,
     Trial,
     cheap_settings,
-    continued,
+    continue_fit,
     leaves,
-    tried,
+    run_trial,
 )
 from optid.identify.verdict import Verdict
 from optid.packing import Unsendable, pack
@@ -146,7 +146,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
         raise DataError(f"{not_a_record(data, 'identify')} A search fits a record many times, in memory.")
     most = effort_of(effort)
     if budget is not None and (not is_number(budget) or not budget > 0 or LARGEST < budget < np.inf):
-        raise StructureError(f"budget must be a positive number of seconds; got {shown(budget)}")
+        raise StructureError(f"budget must be a positive number of seconds; got {short_repr(budget)}")
     Settings(accuracy)  # every trial would refuse it
     for word in classes:
         one_of("classes", word, KINDS)
@@ -172,7 +172,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
         raise StructureError(f"workers={workers!r}: {alone}, or use workers=1")
     begun = time.process_time()
 
-    def left() -> float:
+    def seconds_left() -> float:
         if budget is None or ladder.choice() is None:  # a model is worth more than the budget
             return np.inf
         elsewhere = sum(trial.seconds for trial in ladder.trials.values()) if pool.apart else 0.0
@@ -181,8 +181,8 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     meter = Meter("search", most, lambda: sum(ladder.spent.values()))
     with meter if progress is None else nullcontext(progress) as told:
         try:
-            run = partial(_run, pool, kept, left, partial(_told, ladder, told, most))
-            stopped, unfinished = _climb(ladder, possible, run, most, left)
+            run = partial(_run, pool, kept, seconds_left, partial(_told, ladder, told, most))
+            stopped, unfinished = _climb(ladder, possible, run, most, seconds_left)
             for kind in possible:
                 log.info("search: %s", _summary(ladder, kind))
             if stopped == BUDGET:
@@ -282,7 +282,7 @@ def _share(ladder: Ladder, kind: str) -> float:
 
 def _different(ladder: Ladder, batch: Sequence[StructureCandidate]) -> list[StructureCandidate]:
     """Return the candidates of a batch, each once."""
-    return list({c.key: c for c in map(ladder.levelled, batch)}.values())
+    return list({c.key: c for c in map(ladder.with_levels, batch)}.values())
 
 
 def _tried(ladder: Ladder, kind: str, batch: Sequence[StructureCandidate], run: Runs, most: float) -> None:
@@ -304,7 +304,7 @@ def _tried(ladder: Ladder, kind: str, batch: Sequence[StructureCandidate], run: 
 def _run(pool: TrialPool, kept: KeptTrials, left: Callable[[], float], told: Callable[[Trial], None],
          batch: Sequence[StructureCandidate], rival: Trial | None) -> list[Trial | None]:
     """Return the trials of candidates against a rival, kept ones or new; None where no time was left."""
-    known = [kept.known(candidate, rival) for candidate in batch]
+    known = [kept.find_trial(candidate, rival) for candidate in batch]
     new = pool.run([(candidate, rival) for candidate, trial in zip(batch, known) if trial is None], left, told)
     kept.keep([trial for trial in new if trial is not None], rival)
     rest = iter(new)
@@ -316,7 +316,7 @@ def _attempt(blocks: Blocks, settings: Mapping[str, Any], rules: Sequence[Any], 
              task: tuple[StructureCandidate, Trial | None], seconds: float) -> Trial:
     """Try a candidate against a rival, for so many CPU seconds at most."""
     candidate, rival = task
-    return tried(candidate, blocks, rival, settings, rules, horizon, seconds)
+    return run_trial(candidate, blocks, rival, settings, rules, horizon, seconds)
 
 
 def _unsendable(rules: Sequence[Any], solver: Any) -> str:
@@ -384,7 +384,7 @@ def _refitted(chosen: Trial, data: Data, blocks: Blocks, horizon: int | None, se
 
     if chosen.restarted is None:
         return as_tried(data)
-    return continued(candidate, as_tried, data, as_tried(blocks.without(chosen.restarted)).model)
+    return continue_fit(candidate, as_tried, data, as_tried(blocks.without(chosen.restarted)).model)
 
 
 def _told(ladder: Ladder, progress: Callable[[str], None], most: float, trial: Trial) -> None:

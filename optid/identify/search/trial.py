@@ -143,7 +143,7 @@ class Trial:
         return float(np.median(gains)) if gains.size else -np.inf
 
 
-def tried(candidate: StructureCandidate, blocks: Blocks, rival: Trial | None, settings: Mapping[str, Any],
+def run_trial(candidate: StructureCandidate, blocks: Blocks, rival: Trial | None, settings: Mapping[str, Any],
           constraints: Sequence[Any], horizon: int | None, seconds: float = np.inf) -> Trial:
     """Fit a candidate, cross-validate it block by block, and stop early where it cannot beat its rival.
 
@@ -152,7 +152,7 @@ def tried(candidate: StructureCandidate, blocks: Blocks, rival: Trial | None, se
     """
     clock, found, fits, searches = time.process_time(), Trial(candidate), 0, 0
 
-    def fitted(data: Any, **more: Any) -> Any:
+    def fit_candidate(data: Any, **more: Any) -> Any:
         nonlocal fits, searches
         if time.process_time() - clock > seconds:  # where nothing interrupts a fit
             raise OutOfTime
@@ -163,7 +163,7 @@ def tried(candidate: StructureCandidate, blocks: Blocks, rival: Trial | None, se
         with cpu_limit(seconds), warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # the fit that is chosen tells them
             arguments = {**cheap_settings(candidate), **candidate.under(constraints), **_bases(candidate, blocks.data)}
-            for known in _steps(found, fitted(blocks.data), fitted, blocks, rival, horizon):
+            for known in _steps(found, fit_candidate(blocks.data), fit_candidate, blocks, rival, horizon):
                 found = known
                 if known.reason:
                     break
@@ -207,7 +207,7 @@ def _steps(known: Trial, whole: Fit, fitted: Callable[..., Fit], blocks: Blocks,
             if searched and known.restarted is None:
                 again = whole
                 with suppress(OptidError):
-                    again = continued(known.candidate, fitted, blocks.data, found.model)
+                    again = continue_fit(known.candidate, fitted, blocks.data, found.model)
                 if again.solution.objective < (1 - EQUAL) * whole.solution.objective:
                     yield from _steps(replace(known, restarted=b), again, fitted, blocks, rival, horizon)
                     return
@@ -249,7 +249,7 @@ def _no_better(candidate: StructureCandidate, energies: Array, measures: Array, 
     return ""
 
 
-def continued(candidate: StructureCandidate, fitted: Callable[..., Fit], data: Data, model: Any) -> Fit:
+def continue_fit(candidate: StructureCandidate, fitted: Callable[..., Fit], data: Data, model: Any) -> Fit:
     """Return the fit of a candidate that goes on from a model of the same structure."""
     return fitted(data, initial=model, **CONTINUED.get(candidate.formulation, {}))
 
@@ -265,7 +265,7 @@ def _left_out(candidate: StructureCandidate, fitted: Callable[..., Fit], blocks:
     if candidate.formulation not in STATE_FITS:
         return fitted(data), False
     try:
-        found = continued(candidate, fitted, data, whole)
+        found = continue_fit(candidate, fitted, data, whole)
     except RankError:  # no run from it stays finite
         if not latent:
             raise

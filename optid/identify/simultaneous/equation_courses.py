@@ -112,7 +112,7 @@ class EquationCourses(Courses):
         if found and np.isfinite(found[0].value):
             x = found[0].x
             p, first = errors.split(x)
-            runs = [errors.visited(i, state, p)[1:] / errors.usual[:n] for i, state in enumerate(first)]
+            runs = [errors.run_states(i, state, p)[1:] / errors.usual[:n] for i, state in enumerate(first)]
             return self._start(x, runs), True
         courses = [errors.course(i) / errors.usual[:n] for i in range(len(errors.labels))]
         p = np.array(list(errors.equations.parameters.values())) / errors.usual[n:]
@@ -142,7 +142,7 @@ class EquationCourses(Courses):
         data, equations = self.criterion.data, self.criterion.equations
         inputs = {name: cp.Constant(u[:, c]) for c, name in enumerate(data.inputs)}
         parameters = {name: v[name] for name in equations.parameters}
-        found = equations.evaluated({**inputs, **parameters, **states}, data.outputs)
+        found = equations.evaluate({**inputs, **parameters, **states}, data.outputs)
         return {name: cp.Constant(np.zeros(len(u))) + value for name, value in found.items()}
 
 
@@ -169,7 +169,7 @@ def _reweighted(pose: Pose, errors: PhysicalErrors, constraints: Sequence[Any], 
         if not solution.has_point:
             return None
         if left:
-            errors, settled = errors.reweighted(errors.variables.pack(solution.values)), True
+            errors, settled = errors.reweight(errors.variables.pack(solution.values)), True
             start = {name: solution.values[name] for name in problem.start}
     problem.compressed.settle(solution.values)
     if solution.status.is_optimum:

@@ -52,7 +52,7 @@ class StateCourses(Courses):
     def start(self) -> dict[str, Array]:
         """Return the unknowns with the courses of their run."""
         errors = self.criterion
-        runs = errors.visited(errors.unknowns.unpack(self.x))
+        runs = errors.run_states(errors.unknowns.unpack(self.x))
         return self.complete({**errors.variables.values(self.x),
                                **dict(zip([f"states{label}" for label in errors.labels], runs))})
 
@@ -82,7 +82,7 @@ class StateCourses(Courses):
 
     def confining(self, v: Expressions) -> dict[str, Any]:
         """Return that the step from x is orthogonal to what changes no output."""
-        step = self.criterion.variables.stacked(v) - self.x
+        step = self.criterion.variables.stack(v) - self.x
         return {GAUGE: self._still @ step == 0} if len(self._still) else {}
 
     def further(self, v: Expressions, x: Values) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from optid.core.leaves import Product
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import check_offset
-from optid.identify.prediction_error.search import arx_start, iterated
+from optid.identify.prediction_error.search import arx_start, iterate_passes
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.identify.simultaneous.courses import Courses, Expressions, Formula, Reading, check_size
 from optid.program.sizes import GAUGE
@@ -95,9 +95,9 @@ class TransferCourses(Courses):
         """Return the best of equation error, Steiglitz-McBride and instruments, and its run: all equations hold."""
         errors, na = self.criterion, self.criterion.unknowns.layout.na
         found = arx_start(errors)
-        others = [iterated(errors, found.x, method) for method in ("Steiglitz-McBride", "instruments")]
+        others = [iterate_passes(errors, found.x, method) for method in ("Steiglitz-McBride", "instruments")]
         best = min([found, *(one for one in others if one is not None)], key=lambda one: one.value)
-        x = errors.normalised(best.x)
+        x = errors.normalise(best.x)
         start = errors.variables.values(x)
         start.pop("x0", None)  # the first outputs are the initial state
         for c in range(errors.data.m):

@@ -11,7 +11,7 @@ import numpy as np
 
 from optid.arrays import Array, as_list
 from optid.data.record import Data
-from optid.data.stretches import interpolated
+from optid.data.stretches import interpolate_missing
 from optid.errors import DataError, RankError
 from optid.models.hammerstein_ss import HammersteinSS
 
@@ -58,7 +58,7 @@ def impute(data: Data, estimate: Callable[[list[Array]], HammersteinSS]) -> tupl
     if np.any(np.sum(~np.isnan(stacked), axis=0) < 2):
         raise RankError("an output has fewer than two samples: leave it out")
     spread, (low, high) = np.nanstd(stacked, axis=0), clipping_range(stacked)
-    filled, count, change, rounds = [interpolated(y) for y in outputs], int(np.sum(np.isnan(stacked))), np.inf, 0
+    filled, count, change, rounds = [interpolate_missing(y) for y in outputs], int(np.sum(np.isnan(stacked))), np.inf, 0
     while rounds < ROUNDS and change > SETTLED:
         rounds += 1
         model = estimate([np.hstack([e.u, y]) for e, y in zip(data.experiments, filled)])

@@ -52,7 +52,7 @@ class Structured:
         """Return lambda for a weight: the inverse noise variance times the size per output sample."""
         return weight * self.size / max(int(np.sum(self.problem.known)), 1)
 
-    def decomposed(self, values: Values) -> tuple[Array, Array]:
+    def decompose(self, values: Values) -> tuple[Array, Array]:
         """Return the left singular vectors, weights undone, in units of the outputs, and the singular values."""
         problem = self.problem
         theta = np.asarray(values["T"]) if "T" in values else np.zeros((0, problem.l))
@@ -108,7 +108,7 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
 
 def order_scores(structured: Structured, values: Values, rest: Data) -> dict[int, float]:
     """Return the simulation fit in %, on another record, of the models of a point, by order: as given, or all."""
-    order, parts, found = structured.windows.plan.order, structured.decomposed(values), {}
+    order, parts, found = structured.windows.plan.order, structured.decompose(values), {}
     most = min(structured.rank(parts[1]), structured.problem.rows - 1)
     for nx in range(1, min(most, LARGEST) + 1) if order is None else [order] * (order <= most):
         try:
@@ -167,7 +167,7 @@ def structure(plan: Plan) -> Structured:
         known = known.reshape(-1, len(starts))
         known = np.vstack([known, np.ones(len(starts))]) if plan.offset else known
         problem = _weighted(problem, known, np.nan_to_num(np.hstack([signals, outputs])) if past else None)
-    measured = problem.matrix(problem.data, problem.explained(problem.hankel(problem.data)))
+    measured = problem.matrix(problem.data, problem.predictor_coefficients(problem.hankel(problem.data)))
     return Structured(windows, problem, centre, scale, float(np.linalg.norm(measured, 2)))
 
 

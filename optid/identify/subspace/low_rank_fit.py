@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import LARGEST, one_of, shown
+from optid.arrays import LARGEST, one_of, short_repr
 from optid.core.problem import Problem
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.subspace.low_rank import choose_weight, structure
-from optid.identify.subspace.plan import Plan, in_record_units, planned
+from optid.identify.subspace.plan import Plan, in_record_units, make_plan
 from optid.identify.subspace.procedure import SubspaceSteps
 from optid.program.solution import Solution, Status
 from optid.program.units import energy_unit
@@ -27,18 +27,18 @@ def fit_low_rank(pose: Pose, steps: SubspaceSteps, data: Data, weight: float | s
                  noise: float | None, hold_out: float, **settings: Any) -> Procedure:
     """Choose a weight where there are several, solve the problem, and go on as the other subspace methods.
 
-    Arguments and errors as of `formulations.nuclear_subspace.nuclear`; the settings are those of `planned`.
+    Arguments and errors as of `formulations.nuclear_subspace.nuclear`; the settings are those of `make_plan`.
     """
     if not 0 < hold_out < 1:
         raise StructureError(f"hold_out={hold_out!r}: it must be a fraction in (0, 1)")
-    plan = planned("subspace.nuclear", data, **settings)
+    plan = make_plan("subspace.nuclear", data, **settings)
     return in_record_units(_fit(pose, steps, plan, _weights(weight, noise), noise, hold_out), plan)
 
 
 def _weights(weight: float | str | Sequence[float], noise: float | None) -> tuple[float, ...]:
     if noise is not None:
         if not 1 / LARGEST <= noise <= LARGEST or weight != "auto":
-            raise StructureError(f"noise={shown(noise)} is a positive standard deviation that takes the place of "
+            raise StructureError(f"noise={short_repr(noise)} is a positive standard deviation that takes the place of "
                                  "weight=")
         return (1.0,)
     if isinstance(weight, str):
@@ -62,7 +62,7 @@ def _fit(pose: Pose, steps: SubspaceSteps, plan: Plan, weights: tuple[float, ...
     solution: Solution = yield pose(structured, structured.penalty(weight))
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)
-    _, sizes = parts = structured.decomposed(solution.values)
+    _, sizes = parts = structured.decompose(solution.values)
     rank, nx = structured.rank(sizes), plan.order or structured.order(sizes)
     if nx > rank:
         return Evidence.pointless(Status.FAILED, f"order {nx}, but the low-rank matrix has rank {rank} at this weight: "

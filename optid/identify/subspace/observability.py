@@ -63,23 +63,23 @@ class Windows:
         complete, candidates = (sum(max(len(part) - rows + 1, 0) for part in parts) for parts in (runs, self.records))
         return complete < INTACT * candidates and complete < SCARCE * rows * (x.p + x.q + x.l)
 
-    def projected(self) -> Projection:
+    def project(self) -> Projection:
         """Return the projection with the instruments and the weighting of the plan."""
         plan = self.plan
         found = project(self.records, self.expansion, self.alpha, instruments=plan.instruments, offset=plan.offset,
                         form=plan.form, tolerance=None if plan.tolerance is None else max(plan.tolerance, LEAST))
         return found if plan.weighting == BEST else replace(found, weighting=plan.weighting)
 
-    def ordered(self) -> "Observability":
+    def observability_matrix(self) -> "Observability":
         """Return the observability matrix in the weighting of the plan."""
-        projection = self.projected()
+        projection = self.project()
         return self.observability(projection, self.order(projection)[0])
 
     def observability(self, projection: Projection, nx: int) -> "Observability":
         """Return the observability matrix of a projection for order nx."""
         return Observability(self, projection.gamma(nx), projection.scale)
 
-    def instrumented(self) -> "Windows":
+    def with_instruments(self) -> "Windows":
         """Return the same with outputs simulated by preliminary models where these are instruments.
 
         The first model has past outputs as instruments; where the regressors are then singular, it has no feedback.
@@ -94,13 +94,13 @@ class Windows:
         windows = replace(self, plan=replace(plan, instruments="inputs+past"))
         for i in range(plan.iterations):
             try:
-                found = windows.ordered()
+                found = windows.observability_matrix()
             except RankError:
                 if i:
                     raise
                 found = replace(self, plan=replace(plan, instruments="inputs"),
-                                expansion=self.expansion.without_feedback()).ordered()
-            a = found.contracted()
+                                expansion=self.expansion.without_feedback()).observability_matrix()
+            a = found.estimate_dynamics()
             step = found.step(a)
             outputs = simulate_clipped(raw, found.windows.expansion, a, step.form.c,
                                        step.matrices(step.least_squares()))
@@ -114,7 +114,7 @@ class Windows:
         for word in WEIGHTINGS:
             weighted = replace(projection, weighting=word)
             found = self.observability(weighted, nx)
-            error = found.step(found.contracted(), instruments=False).problem.remainder
+            error = found.step(found.estimate_dynamics(), instruments=False).problem.remainder
             tried.append((spectral_radius(found.least_squares()) >= 1, error, weighted))
         return min(tried, key=lambda one: one[:2])[2]
 
@@ -159,7 +159,7 @@ class Observability:
         """Return A (n, n) by least squares."""
         return realise(self.scaled, len(self.scale))[0]
 
-    def contracted(self) -> Array:
+    def estimate_dynamics(self) -> Array:
         """Return A by least squares, contracted where it is unstable."""
         a = self.least_squares()
         radius = spectral_radius(a)
@@ -182,7 +182,7 @@ class Observability:
 
     def model(self) -> HammersteinSS:
         """Return the least-squares model without constraints, A contracted; errors as of `step`."""
-        step = self.step(self.contracted())
+        step = self.step(self.estimate_dynamics())
         return step.model(step.start())
 
 
@@ -198,8 +198,8 @@ def estimate_observability(plan: Plan) -> Observability:
         windows, imputed = replace(windows, records=filled), {"missing outputs": how}
         warnings.warn(f"missing outputs leave too few complete windows of {2 * windows.alpha} samples; {how}. The "
                       "criterion of the last step uses the samples present", DataWarning, stacklevel=2)
-    windows = windows.instrumented()
-    projection, expansion = windows.projected(), windows.expansion
+    windows = windows.with_instruments()
+    projection, expansion = windows.project(), windows.expansion
     nx, reason = windows.order(projection)
     figures: dict[str, Any] = {
         "order": nx, **({"order chosen": reason} if reason else {}), "block rows": windows.alpha,
@@ -228,5 +228,5 @@ def _preliminary(windows: Windows) -> HammersteinSS:
         warnings.simplefilter("ignore", DataWarning)  # about a model that only serves to estimate
         if windows.expansion.q and not plan.instruments.endswith("past"):  # a model that predicts; the last counts
             plan = replace(plan, instruments=f"{plan.instruments}+past")
-        found = replace(windows, plan=plan).instrumented().ordered()
+        found = replace(windows, plan=plan).with_instruments().observability_matrix()
         return with_noise_or_reason(found.model(), plan.data)[0]

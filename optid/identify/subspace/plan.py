@@ -24,7 +24,7 @@ WORDS = {"observer": ("auto", "none", "kalman"), "split": ("exact", "lumped"), "
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The request to a method; see `planned`. Attributes have the meaning of the arguments of `hammerstein_ss.sid`."""
+    """The request to a method; see `make_plan`. Attributes mean what the arguments of `hammerstein_ss.sid` do."""
 
     name: str
     data: Data
@@ -87,7 +87,7 @@ class Plan:
         return tuple(bool(one) for one in given)
 
 
-def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, offset: bool = True, **settings: Any
+def make_plan(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, offset: bool = True, **settings: Any
             ) -> Plan:
     """Plan a method on a record in memory, in its own units (`optid.program.units`); the settings are further fields.
 
@@ -102,7 +102,7 @@ def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, of
     units = own_units(data, [isinstance(one, Linear) for one in inputs], bool(offset))
     if any(isinstance(one, UserFunctions) for one in outputs):  # known in the units of the record only
         units = Transform.identity(data.m, data.l)
-    inner = [one and one.mapped(1 / scale, -level / scale)[0]
+    inner = [one and one.in_units(1 / scale, -level / scale)[0]
              for one, scale, level in zip(outputs, units.y_scale, units.y_offset)]
     return Plan(name, in_units(data, units), basis=inner_bases(inputs, units), offset=bool(offset), units=units,
                 feedback_basis=inner if any(inner) else None, **settings)
@@ -118,5 +118,5 @@ def in_record_units(procedure: Procedure, plan: Plan) -> Procedure:
 
 
 def _extended(evidence: Evidence, units: Transform) -> tuple[Any, dict[str, Any]]:
-    model, figures = evidence.extended()
+    model, figures = evidence.run_extension()
     return model.with_transform(units), figures

@@ -19,7 +19,7 @@ from optid.data.record import Data
 from optid.errors import DataWarning
 from optid.identify.noise import with_noise_or_reason
 from optid.identify.subspace.observability import INSIDE, Observability, estimate_observability
-from optid.identify.subspace.plan import Plan, in_record_units, planned
+from optid.identify.subspace.plan import Plan, in_record_units, make_plan
 from optid.identify.subspace.realisation import Realisation
 from optid.identify.subspace.shift import constrained_shift
 from optid.models.roots import spectral_radius
@@ -46,8 +46,8 @@ class SubspaceSteps:
     stable: Callable[[float], Any]
 
     def fit(self, name: str, data: Data, **settings: Any) -> Procedure:
-        """Plan a method (`planned`), run it, and return its model in the units of the record."""
-        plan = planned(name, data, **settings)
+        """Plan a method (`make_plan`), run it, and return its model in the units of the record."""
+        plan = make_plan(name, data, **settings)
         return in_record_units(self.run(plan), plan)
 
     def run(self, plan: Plan, found: Observability | None = None) -> Procedure:

@@ -154,7 +154,7 @@ class Realisation:
         if not any(basis.size > 1 for basis in x.inputs):
             return found
         signs = np.where([isinstance(basis, Linear) for basis in x.inputs], 1.0, found.gain_signs)
-        return replace(found.turned(signs), gauge="norm")
+        return replace(found.with_signs(signs), gauge="norm")
 
 
 def observer_problem(records: Sequence[Array], form: ObserverForm, plan: Plan, targets: Sequence[Array] | None = None

@@ -23,7 +23,7 @@ from optid.identify.validation.predictions import (
     fit_by_horizon,
     one_step,
     predictors,
-    simulated,
+    simulate_outputs,
     simulated_or_nan,
 )
 from optid.identify.validation.structure import Structure, structure_test
@@ -210,7 +210,7 @@ def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> 
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DataWarning)
-            outputs = tuple(simulated(model, data, word, x0))
+            outputs = tuple(simulate_outputs(model, data, word, x0))
     except DataError as error:
         notes.append(f"No simulation. {error}" if word == SIMULATION else f"No simulation with {word}. {error}")
         return ()

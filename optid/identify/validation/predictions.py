@@ -37,7 +37,7 @@ def one_step(model: Any, data: Data, horizon: int = 1) -> list[Array]:
     return as_list(model.predict(data, horizon))
 
 
-def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -> list[Array]:
+def simulate_outputs(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -> list[Array]:
     """Return the outputs (N, l) of every experiment by "simulation" or "measured feedback", x0 as the model takes it.
 
     A missing input, or a simulation that leaves the range of the data, is a `DataError`.
@@ -46,7 +46,7 @@ def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -
 
 
 def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Array]:
-    """Return what `simulated` does, from one missing input to the next; NaN there and where the simulation diverges."""
+    """Simulate the outputs from one missing input to the next; NaN there and where the simulation diverges."""
     found = []
     for i, e in enumerate(data.experiments):
         runs = runs_of(np.isfinite(e.u).all(axis=1)).tolist()
@@ -55,7 +55,7 @@ def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Arr
             if len(runs) > 1 and last - first < RESTARTS * max(len(model.poles), 1):  # the state would follow the noise
                 continue
             with suppress(DataError):
-                y[first:last] = simulated(model, data.select(experiments=i).window(first, last), word)[0]
+                y[first:last] = simulate_outputs(model, data.select(experiments=i).window(first, last), word)[0]
         found.append(y)
     return found
 

@@ -16,7 +16,7 @@ from scipy.linalg import lstsq, qr
 from scipy.special import fdtrc, ncfdtr
 
 from optid.arrays import Array
-from optid.identify.informativity.signals import whitened
+from optid.identify.informativity.signals import whiten_rows
 from optid.statistics.factors import ROUNDING
 
 DEPENDENT = 1e-8  # share of its length that a column must keep beside the others not to be a combination of them
@@ -67,7 +67,7 @@ class Regression:
         found = []
         for here, columns in zip(self.present, self.nuisance):
             complete = np.convolve(~here, np.ones(past + 1))[past : len(here)] < 0.5
-            found.append((complete, orthonormal(whitened(self.noise, columns)[complete])))
+            found.append((complete, orthonormal(whiten_rows(self.noise, columns)[complete])))
         return found
 
     @property
@@ -79,7 +79,7 @@ class Regression:
         """Whiten columns, (N, ...) per experiment, and project the nuisance out: (R, ...)."""
         found, before = [], 0.0
         for one, (complete, basis) in zip(columns, self._parts):
-            white = whitened(self.noise, one)[complete].reshape(int(complete.sum()), -1)
+            white = whiten_rows(self.noise, one)[complete].reshape(int(complete.sum()), -1)
             before = before + np.sum(white**2, axis=0)
             found.append(white - basis @ (basis.T @ white))
         rows = np.vstack(found)

@@ -12,7 +12,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from optid.arrays import Array
-from optid.identify.validation.structure_design import Poles, denominators, filtered
+from optid.identify.validation.structure_design import Poles, denominators, filter_rational
 from optid.identify.validation.structure_hypothesis import Hypothesis
 from optid.models.recursions import lfilter
 
@@ -106,7 +106,7 @@ def _bent(x: Array) -> Array:
 
 
 def _through(values: Array, poles: Poles, lag: int) -> Array:
-    found = filtered(values - values[:1], poles, lag, pulses=2, twice=False)
+    found = filter_rational(values - values[:1], poles, lag, pulses=2, twice=False)
     return found.reshape(len(found), -1)
 
 

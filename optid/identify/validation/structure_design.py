@@ -10,7 +10,7 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.informativity.process import Process
-from optid.identify.informativity.signals import delayed, held
+from optid.identify.informativity.signals import delay, hold_last
 from optid.identify.validation.score_tests import Regression
 from optid.models.recursions import lfilter
 from optid.models.roots import roots_of
@@ -106,7 +106,7 @@ class Design:
         if data.m > 1 and process.explained < HALF:  # whose dynamics are wrong for one input at least
             raise RankError(f"the low-order dynamics found explain {100 * process.explained:.0f} % of output "
                             f"{data.outputs[o]!r}, too little to compare structures of several inputs")
-        inputs = [held(e.u) for e in data.experiments]
+        inputs = [hold_last(e.u) for e in data.experiments]
         families = tuple(Family.of(data, c) for c in range(data.m))
         _refuse_still_inputs(data, inputs)
         measured = [e.y[:, o] for e in data.experiments]
@@ -117,9 +117,9 @@ class Design:
         poles = tuple(_within(r.poles if known else roots_of(process.noise[1:]), longest) for r in process.responses)
         # a lag too few costs a column, one too many is wrong
         lags = tuple(max(r.nk - 1, 0) if known else 0 for r in process.responses)
-        banks = [[filtered(f.values(u[:, c]) - f.values(u[:1, c]), p, lag) for u in inputs]
+        banks = [[filter_rational(f.values(u[:, c]) - f.values(u[:1, c]), p, lag) for u in inputs]
                  for c, (f, p, lag) in enumerate(zip(families, poles, lags))]
-        decays = [filtered(np.eye(longest, 1), p, 0, pulses=0)[:, :, 0] for p in poles]
+        decays = [filter_rational(np.eye(longest, 1), p, 0, pulses=0)[:, :, 0] for p in poles]
         # until then an output answers to inputs from before its experiment, and afterwards it decays
         past = max(lag + bank[0].shape[1] for lag, bank in zip(lags, banks))
         present, nuisance = [], []
@@ -136,14 +136,14 @@ class Design:
                    Regression(tuple(present), tuple(nuisance), np.ones(1)))
 
 
-def filtered(x: Array, poles: Poles, lag: int, pulses: int = PULSES, twice: bool = True) -> Array:
+def filter_rational(x: Array, poles: Poles, lag: int, pulses: int = PULSES, twice: bool = True) -> Array:
     """Filter the columns of x (N, P), zero before it begins, by J rational functions: (N, J, P).
 
     They span q^-lag B(q) / A(q)^2 for the given poles, 1 / A unless `twice`, with `pulses` more coefficients in B than
     poles in the denominator: B / A' for poles near the given ones is contained up to the square of their error. A chain
     of all-pass filters keeps them apart (Takenaka 1925, Malmquist 1925).
     """
-    stage = np.column_stack([delayed(column, lag) for column in x.T])
+    stage = np.column_stack([delay(column, lag) for column in x.T])
     found = []
     for _ in range(pulses):
         found.append(stage)

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from optid.arrays import Array
-from optid.identify.informativity.signals import delayed
+from optid.identify.informativity.signals import delay
 from optid.identify.validation.score_tests import DISTINCT, LEAST, Regression, orthonormal, solve
 from optid.identify.validation.structure_design import PULSES, Design
 from optid.models.recursions import lfilter
@@ -179,7 +179,7 @@ def _directions(design: Design, point: _Point) -> list[Array]:
     found = []
     for bank, b, mu in zip(design.banks, point.bs, point.mus):
         found += [[x @ mu for x in bank], [np.einsum("njp,j->np", x, b) for x in bank]]
-        wider = [[delayed(f, PULSES + lag) for lag in range(lags)] + [lfilter([1.0], [1.0, -p], f) for p in slow]
+        wider = [[delay(f, PULSES + lag) for lag in range(lags)] + [lfilter([1.0], [1.0, -p], f) for p in slow]
                  for f in (x[:, 0] @ mu for x in bank)]
         found += [[np.column_stack(columns) for columns in wider]] if lags else []
     return [np.hstack(parts) for parts in zip(*found)]

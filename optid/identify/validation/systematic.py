@@ -13,8 +13,8 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.identify.informativity import Informativity
-from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
-from optid.identify.informativity.signals import RecordSignals, delayed, held, respond
+from optid.identify.informativity.lags import lag_columns, memory, powers, stack_experiments, test_addition
+from optid.identify.informativity.signals import RecordSignals, delay, hold_last, respond
 from optid.models.process_dynamics import ProcessDynamics, ProcessStructure
 
 LEVEL = 1e-3
@@ -66,7 +66,7 @@ def _measured(raw: Data, errors: list[Array], runs: list[Array], told: Informati
     whole = RecordSignals.of(raw)
     kept = len(whole.y)
     present = [np.isfinite(e[: len(y)])[:, None] for e, y in zip(errors[:kept], whole.y)]
-    y = [held(e[: len(y)][:, None]) for e, y in zip(errors[:kept], whole.y)]
+    y = [hold_last(e[: len(y)][:, None]) for e, y in zip(errors[:kept], whole.y)]
     signals = replace(whole, y=tuple(y), present=tuple(present))
     rows = sum(int(there.sum()) for there in present)
     times = [np.arange(float(len(u))) if e.stamps is None else e.stamps[: len(u)] / raw.dt
@@ -76,16 +76,16 @@ def _measured(raw: Data, errors: list[Array], runs: list[Array], told: Informati
     most = max(rows // ROWS, 1)
     columns = [c[:, :most] for c in columns]
     na = memory(signals, 0) + 1
-    parts = stacked(signals, na, 0, lambda i, first, last: [
+    parts = stack_experiments(signals, na, 0, lambda i, first, last: [
         part[present[i][first:last, 0]] for part in (
-            np.hstack([np.ones((last - first, 1)), lagged(y[i][:, 0], range(1, na + 1), first, last)]),
+            np.hstack([np.ones((last - first, 1)), lag_columns(y[i][:, 0], range(1, na + 1), first, last)]),
             columns[i][first:last], y[i][first:last, 0])])
     if not parts or len(parts[2]) < parts[0].shape[1] + 2 * parts[1].shape[1]:
         return None
     past, inputs, error = parts
-    p_value = added(error, past, inputs).p_value if raw.is_regular else added(*_white_in_time([
+    p_value = test_addition(error, past, inputs).p_value if raw.is_regular else test_addition(*_white_in_time([
         (e[here], c[here[:, 0]], t[here[:, 0]]) for e, c, t, here in zip(y, columns, times, present)])).p_value
-    alone = added(error, np.ones((len(error), 1)), inputs)
+    alone = test_addition(error, np.ones((len(error), 1)), inputs)
     rest = float(np.var(error))
     spare = max(len(error) - 1 - alone.columns, 1)
     explained = rest * max(alone.share - (1 - alone.share) * alone.columns / spare, 0.0)
@@ -102,9 +102,9 @@ def _columns(u: Array, signals: RecordSignals, told: Informativity, o: int) -> A
         for x in powers(u[:, c], signals.levels(c)):
             if response is not None:
                 shaped = respond(response.poles[response.poles != 1], x)
-                first += [delayed(shaped, response.nk + j) for j in range(LAGS)]
+                first += [delay(shaped, response.nk + j) for j in range(LAGS)]
             lag = 0 if response is None else response.nk
-            more += [delayed(respond((float(np.exp(-1 / tau)) if tau else 0.0,), x), late)
+            more += [delay(respond((float(np.exp(-1 / tau)) if tau else 0.0,), x), late)
                      for tau in TAUS for late in sorted({told.least, max(lag, told.least)})]
     return np.column_stack([*first, *more])
 

@@ -86,7 +86,7 @@ def _run(cell: Cell, given: float) -> dict[str, Any]:
 
     if held := _too_much(peak, cell):  # unseen by the parent; above the limit there is no result
         found, fitted = {"outcome": MEMORY_LIMIT, "reason": held}, None
-    row = complete({**known(cell), **found, "started": started.isoformat(), "peak_mb": peak.mb(),
+    row = complete({**known_columns(cell), **found, "started": started.isoformat(), "peak_mb": peak.mb(),
                     "base_mb": peak.start, "total_s": time.perf_counter() - clock})
     if fitted is None:
         return row
@@ -110,20 +110,20 @@ def keep(row: Mapping[str, Any]) -> None:
 def prepare() -> None:
     """Import what every fit needs and load compiled kernels, so that no cell includes that time."""
     from optid.examples import dead_zone
-    from optid.identify.validation.predictions import one_step, simulated
+    from optid.identify.validation.predictions import one_step, simulate_outputs
 
     data = dead_zone(n=100).data
     tried: dict[str, dict[str, Any]] = {"hammerstein_arx.exact": {"basis": "triangular:4"}, "arx": {}}
     for name, options in tried.items():
         model = fit(data, name, na=1, nb=1, prove=False, **options).model
         one_step(model, data)
-        simulated(model, data)
+        simulate_outputs(model, data)
 
 
 def lost_row(cell: Cell, outcome: str, reason: str, *, started: datetime | None = None, total_s: float | None = None
              ) -> dict[str, Any]:
     """Return the row of a cell that returned none: the reason, its start (by default now) and its duration."""
-    return complete({**known(cell), "outcome": outcome, "reason": reason, "total_s": total_s,
+    return complete({**known_columns(cell), "outcome": outcome, "reason": reason, "total_s": total_s,
                      "started": (started or datetime.now(UTC)).isoformat()})
 
 
@@ -138,7 +138,7 @@ def versions_of(cell: Cell) -> dict[str, str]:
     return determining(cell.formulation_name, cell.solver_name, cell.data_source.system is not None)
 
 
-def known(cell: Cell) -> dict[str, Any]:
+def known_columns(cell: Cell) -> dict[str, Any]:
     """Return the columns of a cell that are known before it runs."""
     entry = cell.data_source
     found = {name: getattr(cell, name) for name in NAMES if hasattr(cell, name)}
@@ -251,7 +251,7 @@ def _warm(cell: Cell, fitted: Fit, row: dict[str, Any], limit: float, given: flo
 def _figures(model: Any, record: Record, remarks: list[str | None]) -> dict[str, Any]:
     """Return the figures of a model; one that fails is left out, with a remark."""
     from optid.identify.validation import fit_percent
-    from optid.identify.validation.predictions import one_step, simulated
+    from optid.identify.validation.predictions import one_step, simulate_outputs
 
     def attempt(what: str, compute: Callable[[], Any]) -> Any:
         try:
@@ -266,7 +266,7 @@ def _figures(model: Any, record: Record, remarks: list[str | None]) -> dict[str,
         raw = record.holdout.raw()
         measured = np.vstack([e.y for e in raw.experiments])
         for name, what, outputs in (("one_step_fit", "one-step fit", one_step),
-                                    ("simulation_fit", "simulation fit", simulated)):
+                                    ("simulation_fit", "simulation fit", simulate_outputs)):
             fits = attempt(what, lambda outputs=outputs: fit_percent(measured, np.vstack(outputs(model, raw))))
             if fits is not None:
                 row |= {name: float(np.mean(fits)), f"{name}s": as_json(fits)}

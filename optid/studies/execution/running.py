@@ -13,9 +13,9 @@ from typing import Any
 from optid.data.reduction import available_cores
 from optid.errors import DatabaseError, StudyError, nearest
 from optid.studies.definition import Definition, as_toml
-from optid.studies.execution.cell import known, lost_row
+from optid.studies.execution.cell import known_columns, lost_row
 from optid.studies.execution.executors import run_here, run_with
-from optid.studies.grid import Cell, cells, check_unchanged, located
+from optid.studies.grid import Cell, cells, check_unchanged, with_absolute_paths
 from optid.studies.storage.rows import COLUMNS, KILLED, NAMES, OUTCOMES, REFUSED
 from optid.studies.storage.store import LABELS, Store
 from optid.studies.trial import check_data
@@ -90,7 +90,7 @@ def describe_previous_run(store: Store, study: Definition) -> str:
     axes = {"data": study.data, "formulation": study.formulations, "solver": study.solvers}
     known_labels = [{entry.name for entry in entries} for entries in axes.values()]
     counts: Counter[str] = Counter()
-    for labels, count in store.superseded(study.name).items():
+    for labels, count in store.count_superseded(study.name).items():
         gone = [f"{axis} {label} is no longer in the study" for axis, label, names in zip(axes, labels, known_labels)
                 if label not in names]
         counts[gone[0] if gone else ""] += count
@@ -117,7 +117,7 @@ def _prepared(store: Store, study: Definition, grid: list[Cell], accept_changed_
     store.keep(study.name, [cell.identity for cell in grid])
     store.set_aside(study.name, [KILLED, *retry])
     store.append(_relabelled(store, grid, retry))
-    done = store.finished(study.name)
+    done = store.finished_rows(study.name)
     return [cell for cell in grid if cell.identity not in done]
 
 
@@ -168,7 +168,7 @@ def _all_rows(todo: Sequence[Cell], execute: Execution) -> Generator[Row, None, 
 
 def _description(study: Definition) -> str:
     try:
-        return as_toml(replace(study, data=tuple(located(entry, study.folder) for entry in study.data)))
+        return as_toml(replace(study, data=tuple(with_absolute_paths(entry, study.folder) for entry in study.data)))
     except StudyError:  # records in memory, and other values that TOML does not hold, have no text
         return ""
 
@@ -179,7 +179,7 @@ def _relabelled(store: Store, grid: Iterable[Cell], retry: Sequence[str]) -> lis
     any_study = {identity[1:] for identity in there}
     for cell in grid:
         if cell.identity in any_study:
-            facts = known(cell)
+            facts = known_columns(cell)
             labels = {name: facts[name] for name in LABELS}
             if there.get((cell.study, *cell.identity)) != tuple(labels.values()):
                 wanted[cell.identity] = labels

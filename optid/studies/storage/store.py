@@ -162,7 +162,7 @@ class Store:
             for row in rows[-1:]:
                 self._connection.execute("UPDATE runs SET seen = ? WHERE study = ?", [_now(), row["study"]])
 
-    def finished(self, study: str | None = None) -> set[tuple[str, int]]:
+    def finished_rows(self, study: str | None = None) -> set[tuple[str, int]]:
         """Return (key, repetition) of every row, or of those of one study."""
         return set(self._all(f"SELECT key, repetition FROM rows WHERE {_OF_STUDY}", {"study": study}))
 
@@ -245,7 +245,7 @@ class Store:
         self._connection.execute(f"INSERT INTO superseded ({_LIST}) SELECT {_LIST} FROM rows WHERE {chosen}", values)
         self._connection.execute(f"DELETE FROM rows WHERE {chosen}", values)
 
-    def superseded(self, study: str | None = None) -> dict[tuple[str, str, str], int]:
+    def count_superseded(self, study: str | None = None) -> dict[tuple[str, str, str], int]:
         """Return {(data, formulation, solver): rows set aside}: kept, but in no report."""
         found = self._all("SELECT data, formulation, solver, count(*) FROM superseded "
                           f"WHERE {_OF_STUDY} GROUP BY data, formulation, solver", {"study": study})
@@ -355,12 +355,12 @@ def read_rows(path: str | Path, study: str | None = None) -> dict[str, np.ndarra
         raise DatabaseError(f"{path} holds invalid values ({error}): use another copy") from None
 
 
-def finished(path: str | Path, study: str | None = None) -> set[tuple[str, int]]:
+def finished_rows(path: str | Path, study: str | None = None) -> set[tuple[str, int]]:
     """Return (key, repetition) of every row of a database, or of one study; empty where there is no database yet."""
     if not Path(path).exists():
         return set()
     with Store(path) as store:
-        return store.finished(study)
+        return store.finished_rows(study)
 
 
 def rows_of_one(path: str | Path, study: str | None = None) -> Any:

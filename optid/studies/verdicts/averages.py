@@ -68,7 +68,8 @@ class Paired:
         return (1 / (1 + slack), 1 + slack) if self.ratio else (-slack, slack)
 
 
-def paired(values: np.ndarray, reference: np.ndarray, ratio: bool = True, groups: np.ndarray | None = None) -> Paired:
+def paired_mean(values: np.ndarray, reference: np.ndarray, ratio: bool = True,
+                groups: np.ndarray | None = None) -> Paired:
     """Return the mean of ``values / reference`` or ``values - reference``, with its interval by Student's distribution.
 
     Args:
@@ -78,7 +79,7 @@ def paired(values: np.ndarray, reference: np.ndarray, ratio: bool = True, groups
         groups: (P,) labels; if given, the mean of each group counts as one.
     """
     if ratio:
-        logs = paired(np.log(values), np.log(reference), False, groups)
+        logs = paired_mean(np.log(values), np.log(reference), False, groups)
         value, low, high = (float(v) for v in np.exp([logs.value, logs.low, logs.high]))
         return Paired(value, low, high, logs.n, True)
     both = np.isfinite(values) & np.isfinite(reference)

@@ -5,8 +5,8 @@ from itertools import combinations
 
 import numpy as np
 
-from optid.studies.verdicts.averages import LEVEL, MINIMUM_PAIRS, Paired, paired, sign_test
-from optid.studies.verdicts.statement import listed, there_are
+from optid.studies.verdicts.averages import LEVEL, MINIMUM_PAIRS, Paired, paired_mean, sign_test
+from optid.studies.verdicts.statement import join_names, there_are
 
 FIRST, TIE, CANNOT_TELL, ONLY_ONE, NOBODY = "first", "tie", "cannot tell", "only one", "nobody"
 DEPENDS = "depends"
@@ -66,7 +66,7 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
         return Choice(NOBODY, solved=solved, missing="needs a solver that reaches the accuracy")
 
     def compare(one: np.ndarray, other: np.ndarray) -> Paired:
-        return paired(one, other, ratio, groups)
+        return paired_mean(one, other, ratio, groups)
 
     allowed = int(slack * len(costs))
     best = known[:, [int(np.argmax(counts))]]
@@ -82,8 +82,9 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
     leaders = [s for s in unbeaten if counts[s] >= max(counts[unbeaten]) - allowed]
     common = known[:, leaders].all(axis=1)
     if not leaders or not common.any():
-        circle = f"has no order: pairwise comparisons are cyclic, each of {listed(candidates)} is beaten by another one"
-        missing = f"needs a {noun} that {listed([names[s] for s in leaders])} all solve" if leaders else circle
+        circle = "has no order: pairwise comparisons are cyclic, "
+        circle += f"each of {join_names(candidates)} is beaten by another one"
+        missing = f"needs a {noun} that {join_names([names[s] for s in leaders])} all solve" if leaders else circle
         return Choice(CANNOT_TELL, "", (), candidates, {}, solved, missing)
     lead = min(leaders, key=lambda s: compare(np.where(common, costs[:, s], np.nan), np.ones(len(costs))).value)
     against = {names[s]: compare(costs[:, s], costs[:, lead]) for s in np.flatnonzero(counts) if s != lead}

@@ -11,7 +11,7 @@ from optid.phrases import seconds
 from optid.studies.storage.rows import ERROR, REFUSED, columns
 from optid.studies.verdicts.averages import MINOR
 from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, tabulate
-from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, grouped, listed
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, group_words, join_names
 from optid.studies.verdicts.verdict import StudyVerdict, conclude
 
 
@@ -43,7 +43,7 @@ class SolverComparison:
     @property
     def reasons(self) -> dict[str, list[str]]:
         """Solvers that did not solve it, by reason."""
-        return grouped((line.reason, line.solver) for line in self.lines if line.state != SOLVED and line.reason)
+        return group_words((line.reason, line.solver) for line in self.lines if line.state != SOLVED and line.reason)
 
     @property
     def common_error(self) -> str | None:
@@ -61,8 +61,8 @@ class SolverComparison:
         if not solved and not self.lines:
             return Statement(FAIR, "No solver takes this formulation", "choose others (optid solvers).")
         if not solved:
-            states = grouped((line.state, line.solver) for line in self.lines)
-            why = "; ".join(f"{state}: {listed(names)}" for state, names in states.items())
+            states = group_words((line.state, line.solver) for line in self.lines)
+            why = "; ".join(f"{state}: {join_names(names)}" for state, names in states.items())
             return Statement(BAD, f"No solver reached {at}", f"{counting(self.accuracy)}; {why}.")
         first, *others = solved
         close = [line for line in others if line.cold <= (1 + MINOR) * first.cold and line.proved == first.proved]
@@ -76,8 +76,8 @@ class SolverComparison:
             text += " (without a proof)" if first.proved and not rest[0].proved else ""
         elif not others:
             failed = [line.solver for line in self.lines if line is not first]
-            text += f"; {listed(failed)} did not" if failed else "; there is no other to compare it with"
-        either = " or ".join(names) if len(names) < 4 else f"any of {listed(names)}"
+            text += f"; {join_names(failed)} did not" if failed else "; there is no other to compare it with"
+        either = " or ".join(names) if len(names) < 4 else f"any of {join_names(names)}"
         return Statement(GOOD, f"Use {either}", f"{text}.")
 
     @property

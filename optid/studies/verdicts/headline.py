@@ -8,7 +8,7 @@ from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, O
 from optid.studies.verdicts.models import DataSet, Quality
 from optid.studies.verdicts.outcomes import Results
 from optid.studies.verdicts.standings import Standing, StandingsSection
-from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, listed, of
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, join_names, of
 
 RARE = 0.01  # share of refused problems, or of false claims, up to which a solver is recommended
 LONGEST = 90  # characters of a headline
@@ -29,11 +29,12 @@ def headline(overall: StandingsSection, sections: tuple[StandingsSection, ...], 
     if len(sections) < 2 or everywhere or not decided:
         return solver_statement(overall)
     leaders = _leaders(overall, decided)
-    word = "; ".join(f"{name} for {listed([one.name for one in theirs])}" for name, theirs in leaders.items())
+    word = "; ".join(f"{name} for {join_names([one.name for one in theirs])}" for name, theirs in leaders.items())
     if len(leaders) == 1 and len(decided) == len(sections):
         word = f"Use {next(iter(leaders))}"
     most = max(overall.standings, key=lambda s: (s.solved, s.solver))
-    text = f"{compared(overall.found)}. {most.solver} solved most, {of(most.solved, len(overall.found.data))}."
+    text = f"{describe_comparison(overall.found)}. "
+    text += f"{most.solver} solved most, {of(most.solved, len(overall.found.data))}."
     if len(decided) < len(several):
         text += f" For {len(several) - len(decided)} of {plural(len(several), 'formulation')} it cannot be told."
     if len(several) < len(sections):
@@ -56,7 +57,7 @@ def _leaders(overall: StandingsSection, decided: list[StandingsSection]) -> dict
     return found
 
 
-def compared(found: Results) -> str:
+def describe_comparison(found: Results) -> str:
     """State what was compared: "4 solvers on 24 problems (2 formulations, 1 data set) at an accuracy of 1e-08"."""
     parts = f"{plural(len(set(found.formulation)), 'formulation')}, {plural(len(set(found.data_set)), 'data set')}"
     return (f"{plural(len(found.solvers), 'solver')} on {plural(len(found.data), 'problem')} ({parts}) at an accuracy "
@@ -76,8 +77,8 @@ def solver_statement(section: StandingsSection) -> Statement:
         warm = section.found.measure == "warm"
         return Statement(FAIR, "Cannot tell", "No run has a warm time: it needs a study with warm = true, and a "
                          "procedure of several programmes never has one." if warm else
-                         f"Every solver ({listed(section.idle)}) refuses every problem, or was not run.")
-    text = f"{compared(section.found)}: "
+                         f"Every solver ({join_names(section.idle)}) refuses every problem, or was not run.")
+    text = f"{describe_comparison(section.found)}: "
     if choice.kind == NOBODY:
         failures = sum((Counter(standing.failures) for standing in section.standings), Counter())
         common = ", ".join(f"{word} {count:,}" for word, count in failures.most_common(4))
@@ -96,7 +97,7 @@ def solver_statement(section: StandingsSection) -> Statement:
         return Statement(_tone(lead, n), "Only one solver", text)
     if not section.recommended:
         return Statement(BAD, "No solver can be recommended", text)
-    word = f"A tie: {listed(choice.leaders)}" if choice.kind == TIE else f"Use {lead.solver}"
+    word = f"A tie: {join_names(choice.leaders)}" if choice.kind == TIE else f"Use {lead.solver}"
     if choice.kind == FIRST and lead.refused > RARE * n:
         word += " where it runs"
     return Statement(_tone(lead, n), word, text)
@@ -160,7 +161,7 @@ def model_statement(models: Quality) -> Statement | None:
         return Statement(FAIR, unknown, f"{text}; the comparison {choice.missing}.")
     if not rivals:
         return Statement(FAIR, unknown, f"{text}; no other has one on half as many records.")
-    word = f"{'Equal' if choice.kind == TIE else 'Best'} models: {listed(choice.leaders)}"
+    word = f"{'Equal' if choice.kind == TIE else 'Best'} models: {join_names(choice.leaders)}"
     return Statement(GOOD, word, f"{text}.")
 
 
@@ -181,5 +182,5 @@ def _best_of(models: Quality, one: DataSet) -> str:
     if not one.choice.first:
         return f"on {one.name} the comparison {one.choice.missing}"
     so_far = " so far" if one.choice.kind == CANNOT_TELL else ""
-    best = listed(one.choice.leaders) if one.choice.kind == TIE else one.choice.first
+    best = join_names(one.choice.leaders) if one.choice.kind == TIE else one.choice.first
     return f"on {one.name} {best}{so_far}, {figure(models, one, one.choice.first)} ({plural(one.records, 'record')})"

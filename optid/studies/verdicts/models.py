@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optid.studies.verdicts.averages import MINIMUM_PAIRS, means_of_groups, paired
+from optid.studies.verdicts.averages import MINIMUM_PAIRS, means_of_groups, paired_mean
 from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, TIE, Choice, choose
 from optid.studies.verdicts.outcomes import Results, Table
 
@@ -77,13 +77,13 @@ def compare_formulations(found: Results, table: Table) -> Quality:
     measure = "parameter_error" if errors else "simulation_fit"
     losses = np.maximum(values[measure], SMALLEST) if errors else 100.0 - values[measure]
 
-    def judged(here: np.ndarray, groups: np.ndarray | None = None) -> tuple:
+    def judge(here: np.ndarray, groups: np.ndarray | None = None) -> tuple:
         return (int(here.sum()), dict(zip(names, (row[here] >= 0).sum(axis=0).tolist())),
                 {c: {name: _mean(v[here, f], data[here]) for f, name in enumerate(names)} for c, v in values.items()},
                 choose(losses[here], names, errors, SLACK, "record" if groups is None else "data set", groups))
 
-    sets = tuple(DataSet(name, *judged(data == key)) for key, name in _data_sets(data).items())
-    whole = DataSet("", *judged(np.ones(len(data), dtype=bool), None if len(sets) == 1 else data))
+    sets = tuple(DataSet(name, *judge(data == key)) for key, name in _data_sets(data).items())
+    whole = DataSet("", *judge(np.ones(len(data), dtype=bool), None if len(sets) == 1 else data))
     if 1 < len(sets) < FEW:
         whole = replace(whole, choice=_of_few(sets, whole.choice, losses, names, data, errors))
     return Quality(**vars(whole), formulations=names, measure=measure, sets=sets)
@@ -117,7 +117,7 @@ def _of_few(sets: tuple[DataSet, ...], choice: Choice, losses: np.ndarray, names
         return replace(choice, kind=DEPENDS, first="", tied=(), missing="depends on the data")
     first = choice.first if choice.first in leaders else leaders[0]
     lead = losses[:, names.index(first)]
-    against = {name: paired(loss, lead, errors, data) for name, loss in zip(names, losses.T)
+    against = {name: paired_mean(loss, lead, errors, data) for name, loss in zip(names, losses.T)
                if name != first and choice.solved[name]}
     tied = tuple(name for name in leaders if name != first)
     if len(decided) < len(sets):

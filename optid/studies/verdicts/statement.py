@@ -22,7 +22,7 @@ class Statement:
     text: str  # why, with the numbers
 
 
-def grouped(pairs: Iterable[tuple[Key, str]]) -> dict[Key, list[str]]:
+def group_words(pairs: Iterable[tuple[Key, str]]) -> dict[Key, list[str]]:
     """Return {key: its words}, both in order of appearance."""
     found: dict[Key, list[str]] = {}
     for key, word in pairs:
@@ -48,7 +48,7 @@ def there_are(n: int) -> str:
     return f"there {'is' if n == 1 else 'are'} {n}"
 
 
-def listed(names: Sequence[str], most: int = 4) -> str:
+def join_names(names: Sequence[str], most: int = 4) -> str:
     """Write names as "a, b and c", quoted if one has a comma; of many the first ones and the number of the others."""
     names = list(names)
     if any("," in name or " and " in name for name in names):

@@ -27,7 +27,7 @@ from optid.studies.verdicts.outcomes import (
     tabulate,
 )
 from optid.studies.verdicts.standings import StandingsSection, compare_solvers
-from optid.studies.verdicts.statement import BAD, FAIR, Statement, grouped, listed
+from optid.studies.verdicts.statement import BAD, FAIR, Statement, group_words, join_names
 from optid.studies.verdicts.steps import StepStanding, compare_steps
 
 
@@ -148,7 +148,7 @@ def _failed_data(found: Results) -> Statement | None:
     if not failed:
         return None
     why = found.reason[(keys == failed[0])[:, None] & error][0]
-    text = f"Every run on {listed([key.partition(chr(0))[2] for key in failed])} ended with an error: {why[:200]}"
+    text = f"Every run on {join_names([key.partition(chr(0))[2] for key in failed])} ended with an error: {why[:200]}"
     return Statement(BAD, "Data that failed", text.rstrip(".") + ".")
 
 
@@ -175,7 +175,7 @@ def _false_claims(table: Table, found: Results) -> tuple[FalseClaim, ...]:
     for p, s in zip(*np.nonzero(found.state == CONTRADICTED)):
         winner = found.solvers[int(np.flatnonzero(found.solved[p])[0])]
         lies.append((int(found.row[p, s]), f"{winner} has a verified point"))
-    groups = grouped(((table["solver"][i], table["formulation"][i], table["status_claimed"][i]), reason)
+    groups = group_words(((table["solver"][i], table["formulation"][i], table["status_claimed"][i]), reason)
                      for i, reason in lies)
     claims = [FalseClaim(key[0], key[1], len(reasons), key[2], min(reasons)) for key, reasons in groups.items()]
     return tuple(sorted(claims, key=lambda c: (-c.count, c.solver, c.formulation, c.claimed)))
@@ -184,7 +184,7 @@ def _false_claims(table: Table, found: Results) -> tuple[FalseClaim, ...]:
 def _failures(found: Results) -> tuple[Failure, ...]:
     failed = zip(*np.nonzero(~np.isin(found.state, (SOLVED, NOT_RUN, UNTIMED))))
     said = [(found.solvers[s], str(found.state[p, s]), str(found.reason[p, s])) for p, s in failed]
-    groups = grouped(((solver, state, without_numbers(reason)), reason) for solver, state, reason in said)
+    groups = group_words(((solver, state, without_numbers(reason)), reason) for solver, state, reason in said)
     failures = [Failure(solver, state, reasons[0] if len(set(reasons)) == 1 else shape, len(reasons))
                 for (solver, state, shape), reasons in groups.items()]
     return tuple(sorted(failures, key=lambda f: (f.state == REFUSED, -f.count, f.solver, f.state, f.reason)))

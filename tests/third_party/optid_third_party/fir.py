@@ -58,7 +58,7 @@ def facts(data: Data) -> dict[str, Any]:
 def line(data: Data) -> Basis:
     """Return the basis of a linear input over the range of the record."""
     ((low,), (high,)) = data.ranges()
-    return Linear().fitted(float(low), float(high))
+    return Linear().with_interval(float(low), float(high))
 
 
 def recover(data: Data, values: Mapping[str, np.ndarray]) -> HammersteinTF:
