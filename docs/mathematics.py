@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from optid.registry import FAULTS, FORMULATIONS, registered
+from optid.registry import FAULTS, FORMULATIONS, find_entry_points
 
 ROOT = Path(__file__).parent.parent
 PAGE = Path(__file__).with_name("mathematics.md")
@@ -31,7 +31,7 @@ def page() -> str:
     """Return the page."""
     names = defaultdict(list)
     for group in (FORMULATIONS, FAULTS):
-        for name, point in registered(group).items():
+        for name, point in find_entry_points(group).items():
             if point.module.split(".")[0] == "formulations":
                 names[point.module].append(name)
     parts = [HEAD]

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from optid.cli.app import app
 from optid.examples import example
-from optid.workbench.bench import Source
+from optid.workbench.bench import BenchSource
 from optid.workbench.request import suggest_state
 from optid.workbench.server import Server
 
@@ -53,7 +53,7 @@ def write_pages(browser: Browser, folder: Path) -> None:
 def write_workbench(browser: Browser) -> None:
     """Draw the workbench with the record of the thruster."""
     chosen = example("thruster")
-    server = Server(Source(chosen.data, "", suggest_state(chosen.data, chosen.suggestion)))
+    server = Server(BenchSource(chosen.data, "", suggest_state(chosen.data, chosen.suggestion)))
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         browser.send("Page.navigate", url=server.address)

@@ -89,7 +89,7 @@ class RankOneSQP:
     def _values(self, point: Point) -> dict[str, Array]:
         """Return the values of a point, in the gauge."""
         shapes = {name: np.shape(value) for name, value in self.problem.start.items()}
-        return self.problem.in_gauge(self.form.named(point, shapes))
+        return self.problem.in_gauge(self.form.unpack(point, shapes))
 
     def _lift(self, x: Values) -> Array:
         return self.form.point(x).lift()

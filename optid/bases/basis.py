@@ -268,6 +268,6 @@ def samples(u: ArrayLike) -> Array:
 def span(basis: Basis) -> tuple[float, float]:
     """Return the interval of a basis, or refuse when it has none yet."""
     if basis.interval is None:
-        raise StructureError(f"{type(basis).__name__} has no interval yet: use .fitted(lower, upper) or give "
+        raise StructureError(f"{type(basis).__name__} has no interval yet: use .with_interval(lower, upper) or give "
                              "interval=(lower, upper).")
     return basis.interval

@@ -54,4 +54,4 @@ def reading(files: list[str], how: Mapping[str, Any]) -> str:
 
 def _call(c: ChosenConstraint, more: str = "") -> str:
     arguments = ", ".join(f"{key}={value!r}" for key, value in c.arguments.items())
-    return f"{entry_point(CONSTRAINTS, c.word).attr}({arguments}{more}).named({c.name!r})"
+    return f"{entry_point(CONSTRAINTS, c.word).attr}({arguments}{more}).with_name({c.name!r})"

@@ -14,7 +14,7 @@ from optid.faults import (
     Fault,
     Monitor,
     allocate,
-    decoupled,
+    decouple,
     diagnose,
     dictionary,
     direction_of,
@@ -208,7 +208,7 @@ def test_a_declared_disturbance_of_any_course_changes_nothing(name):
         impulse = unit - inject(model, u, (), noise="none", x0=np.zeros(3))
         for k in range(COUNT):
             y[k:] += course[k] * impulse[: COUNT - k]
-    _, steady = decoupled(model, [name], load)
+    _, steady = decouple(model, [name], load)
     calm, moved = (whiten(found.model, record_of(model, (u, z)), x0="zero", scale=steady).r for z in (healthy, y))
     assert np.abs(moved[4:] - calm[4:]).max() < 1e-2 < np.abs(y - healthy).max() / 100
     assert np.mean(np.sum(calm[4:] ** 2, axis=1)) == pytest.approx(1, abs=0.3)  # one axis of two is left

@@ -12,7 +12,7 @@ from formulations.constraints import shape
 from optid.errors import DataWarning
 from optid.identify.uncertainty import uncertainty
 from optid.program.units import in_units, inverse, own_units
-from optid.registry import FORMULATIONS, registered
+from optid.registry import FORMULATIONS, find_entry_points
 
 GRID = np.linspace(-0.9, 0.9, 7)
 PROBE = np.random.default_rng(5).uniform(-0.9, 0.9, (60, 1))
@@ -118,7 +118,7 @@ def test_units_do_not_matter_to_the_accuracy_of_the_method(name):
 
 
 def test_every_registered_formulation_is_tested():
-    assert {name for name, *_ in (CASES | LOOSE).values()} == set(registered(FORMULATIONS)) - ELSEWHERE
+    assert {name for name, *_ in (CASES | LOOSE).values()} == set(find_entry_points(FORMULATIONS)) - ELSEWHERE
 
 
 @pytest.mark.sampled(8)
