@@ -20,6 +20,7 @@ from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.informativity import Informativity, informativity
 from optid.identify.validation.checks import NOT_TESTED, record_structure, shares_outside, tested_residuals
 from optid.identify.validation.predictions import fit_percent, one_step_or_nan, simulated_or_nan
+from optid.identify.validation.structure_design import MOVES, count_moves
 from optid.identify.validation.systematic import systematic
 from optid.models.functions import has_feedback, step_length
 from optid.phrases import p_equals
@@ -28,6 +29,7 @@ from optid.threads import one_thread
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
 UNKNOWN = "not available"  # how a value begins that is not
+FEW_MOVES = "coloured, by noise or by a response of another kind: inputs that move so seldom do not tell"
 GOOD_FIT, GOOD_BLOCK, POOR_FIT, USELESS_FIT = 85.0, 75.0, 65.0, 20.0
 """Fits in % from which on, and below which, a model is called so; the second is that of its worst block."""
 OVERFIT = 12.0  # points that the cross-validated fit may be below that on the record itself
@@ -155,7 +157,9 @@ def _residuals(model: Any, data: Data, predicted: Sequence[Array]) -> list[Findi
         known = any(np.isfinite(test.p_value) for test in tests[kind].values())
         words = ", ".join(f"{test.output} {f'on {test.input}' if kind[0] == 'c' else 'on its past'}" for test in failed)
         coloured = any(test.significant for test in tests[kind].values())  # of which a model without noise says nothing
-        found.append(Finding(name, words or (("coloured" if coloured else "kept") if known else UNKNOWN), not failed,
+        if coloured and kind == "autocorrelations" and max(count_moves([e.u for e in data.experiments])) < MOVES:
+            words = words or FEW_MOVES
+        found.append(Finding(name, words or (("coloured" if coloured else "kept") if known else UNKNOWN), not words,
                              known))
     return found
 

@@ -624,3 +624,11 @@ def test_state_equations_and_samples_are_those_of_the_process(word, values, tmp_
 def test_what_has_no_state_equations_is_refused_by_name(word, more, message, tmp_path):
     model = process_model(word, tau=3.0, dead_time=1.0, **more)
     refuses(StructureError, message, model.to_c, tmp_path / "plant.c")
+
+
+@pytest.mark.parametrize(("type_", "word"), [("P2D", "good"), ("P1D", "fair")])
+def test_one_step_does_not_tell_coloured_noise_from_another_order(type_, word):
+    true = process_model("P2D", K=2.0, tau1=30.0, tau2=12.0, dead_time=8.0)
+    verdict = fit(record(true, u=np.repeat(STEP, 2)), type_).verdict
+    assert verdict.word == word
+    assert [part.name for part in verdict.failed] == ["whiteness"] * (word == "fair")

@@ -179,12 +179,18 @@ def _touched(lost: NDArray[np.bool_], response: Array, lag: int) -> NDArray[np.b
 
 def _refuse_still_inputs(data: Data, inputs: Sequence[Array]) -> None:
     """Raise `RankError` if all inputs move too few times to compare the responses to their moves."""
-    counts = [sum(_moves(u[:, c], MOVE * float(np.ptp(np.concatenate([v[:, c] for v in inputs])))) for u in inputs)
-              for c in range(data.m)]
+    counts = count_moves(inputs)
     if max(counts) < MOVES:
         name, most = data.inputs[int(np.argmax(counts))], max(counts)
         raise RankError(f"input {name!r} moves {'once' if most == 1 else f'{most} times'} by more than "
                         f"{100 * MOVE:.0f} % of its range; at least {MOVES} moves are compared with each other")
+
+
+def count_moves(inputs: Sequence[Array]) -> list[int]:
+    """Count, up to `MOVES` an experiment, the moves of every input over `MOVE` of its range; NaN are left out."""
+    signals = [[u[~np.isnan(u[:, c]), c] for u in inputs] for c in range(inputs[0].shape[1])]
+    return [sum(_moves(u, MOVE * float(np.ptp(np.concatenate(own) if any(v.size for v in own) else 0.0)))
+                for u in own if u.size) for own in signals]
 
 
 def _moves(u: Array, size: float) -> int:
