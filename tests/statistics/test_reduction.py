@@ -36,7 +36,7 @@ class Cut:
             for a, b in zip(borders, borders[1:]):
                 self.parts.append(Piece(i, e.u[a:b], e.y[a:b]))
 
-    def reduced(self, leaf, merge, threads):
+    def reduce(self, leaf, merge, threads):
         return tree((leaf(part, [(part.u, part.y, None)]) for part in self.parts), len(self.parts), merge)
 
 
@@ -67,7 +67,7 @@ def test_joining_changes_nothing_that_it_is_given(case):
     stream = Cut(data, [[len(e.y) // 2] for e in data.experiments])
     seen = []
 
-    def reduced(leaf, merge, threads):
+    def reduce(leaf, merge, threads):
         runs = [leaf(part, [(part.u, part.y, None)]) for part in stream.parts]
         before = [run.total.complete().copy() for run in runs]
         seen.append([merge(runs).total.complete() for _ in range(2)])
@@ -75,7 +75,7 @@ def test_joining_changes_nothing_that_it_is_given(case):
             np.testing.assert_array_equal(run.total.complete(), complete)
         return merge(runs)
 
-    stream.reduce = reduced
+    stream.reduce = reduce
     total_of_parts(stream, layout, partial(Sums, Frame.of(layout)), chunk, 1)
     np.testing.assert_array_equal(*seen[0])
 

@@ -239,7 +239,7 @@ def test_a_second_connection_of_the_writer_gives_up_none_of_its_locks(path):
     import subprocess
     import sys
 
-    reader = f"from optid.studies.storage.store import finished; print(len(finished({str(path)!r})))"
+    reader = f"from optid.studies.storage.store import finished_rows; print(len(finished_rows({str(path)!r})))"
     made = rows(6)
     with Store(path, write=True) as store:
         for k, row in enumerate(made):
