@@ -80,17 +80,19 @@ def drop_foreign_options(suggestion: Mapping[str, Any], formulation: str) -> dic
     return arguments
 
 
-def at_stamps(how: dict[str, Any], formulation: str = "process.exact") -> dict[str, Any]:
+def at_stamps(how: dict[str, Any], formulation: str | None = None) -> dict[str, Any]:
     """Return the reading options with the stamps kept where the formulation takes any times and no repair is asked for.
 
-    A search tries `process.exact` on such a record. `LookupFailed` for an unknown formulation.
+    Without a formulation there is a search, which tries processes on such a record. `LookupFailed` for an unknown one.
     """
-    from optid.lazy import import_cvxpy
-    from optid.registry import formulation as look_up
+    if formulation is not None:
+        from optid.lazy import import_cvxpy
+        from optid.registry import formulation as look_up
 
-    import_cvxpy()
-    any_times = getattr(look_up(formulation)[1], "takes_any_times", False)
-    return {**how, "gaps": "stamps"} if any_times and how["gaps"] is None and how["resample"] is None else how
+        import_cvxpy()
+        if not getattr(look_up(formulation)[1], "takes_any_times", False):
+            return how
+    return {**how, "gaps": "stamps"} if how["gaps"] is None and how["resample"] is None else how
 
 
 def options_of_model(how: Mapping[str, Any], model: Any) -> dict[str, Any]:

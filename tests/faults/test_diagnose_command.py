@@ -45,7 +45,7 @@ def test_a_record_becomes_a_diagnosis_a_page_and_a_picture(folder, tmp_path):
     assert found.findings == ("no time column: 1 sample = 1; pass --dt (seconds)",)
     assert {**found.to_dict(), "findings": []} == direct.to_dict()
     html = page.read_text()
-    assert "<svg" in html and "sensor:y2" in html and "Diagnosis: faulty" in html
+    assert html.count("data-chart=") == 3 and "sensor:y2" in html and "Diagnosis: faulty" in html
     assert not re.search(r'(src|href)="https?:', html)  # it loads nothing
     assert picture.stat().st_size > 10_000
 

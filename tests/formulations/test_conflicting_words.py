@@ -28,7 +28,7 @@ def record(seed):
         (2, "range:low=-2,high=2", 81.323901), (3, "monotone:decreasing", 63.778834),
         (12, "monotone:decreasing", 62.124550), (26, "range:low=-2,high=2", 73.309533),
         # from the poles of the free optimum, held at first
-        (41, "odd", 154.002735), (83, "odd", 166.379175)))])
+        (41, "odd", 154.002735)))])
 def test_words_that_the_record_contradicts_are_fitted_to_their_optimum(seed, word, least):
     fit = optid.fit(record(seed), "hammerstein_ss.exact", nx=2, basis="triangular:6", constraints=[word])
     assert fit.solution.status is Status.LOCAL
@@ -43,6 +43,13 @@ def test_a_pole_that_creeps_to_the_unit_circle_is_named():
     assert fit.solution.status is Status.LIMIT and "a pole nears the unit circle" in fit.solution.reason
     assert fit.solution.objective < 84  # the descents of one hundred programmes ended at 110
     assert 1 - np.abs(fit.model.poles).max() < 1 / 200
+
+
+@pytest.mark.slow
+def test_a_pair_that_rings_through_the_record_is_tried():
+    """The best optimum inside has 166.38; the errors fall on as a pair nears the unit circle."""
+    fit = optid.fit(record(83), "hammerstein_ss.exact", nx=2, basis="triangular:6", constraints=["odd"], raises=False)
+    assert fit.solution.status is Status.LIMIT and fit.solution.objective < 160
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -59,7 +59,8 @@ LOOSE = {  # with the accuracy of semidefinite programmes, and of a likelihood
 # units stand in the user's equations, or descents are long: tested beside these formulations
 ELSEWHERE = {"physical", "lfr.shooting", "lfr.exact", "wiener_ss.exact", "hammerstein_wiener_ss.exact"}
 LONG = {"hammerstein ss", "prediction", "process"}  # with two inputs
-WEIGHED = ("ss.exact", "ss.shooting", "subspace.nuclear")  # errors in units of their own variances, or of the outputs
+# errors in units of their own variances, or of the outputs
+WEIGHED = ("ss.exact", "hammerstein_ss.exact", "ss.shooting", "hammerstein_ss.shooting", "subspace.nuclear")
 
 
 def record(seed=0, count=200, noise=0.3):
@@ -96,7 +97,7 @@ def facts(fit, r=1.0, s=1.0, level=0.0):
 
 def same(case, accuracy, constrained, units):
     base = fitted(case, constrained=constrained)
-    expected, unit = facts(base), 0 if case[0].endswith(WEIGHED) else 2
+    expected, unit = facts(base), 0 if case[0] in WEIGHED else 2
     for r, s in units:
         other = fitted(case, r, s, constrained=constrained)
         assert other.solution.status is base.solution.status

@@ -41,7 +41,8 @@ def test_pyplot_is_never_imported():
         "import sys, optid; from sample_fits import linear_fit; optid.plots.overview(linear_fit());"
         "print('matplotlib.pyplot' in sys.modules)"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd="tests")
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
+                           cwd="tests/helpers")
     assert found.stdout.strip() == "False"
 
 

@@ -15,13 +15,11 @@ from optid.data.record import Data
 from optid.identify.informativity import Informativity
 from optid.identify.informativity.lags import lag_columns, memory, powers, stack_experiments, test_addition
 from optid.identify.informativity.signals import RecordSignals, delay, hold_last, respond
-from optid.models.process_dynamics import ProcessDynamics, ProcessStructure
 
 LEVEL = 1e-3
 TAUS = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0)  # time constants of the bank, in samples
 LAGS = 2  # samples of a response behind the poles of the record
 FADING = (0.01, *np.geomspace(0.2, 300, 25))  # time constants of noise at irregular times, in mean sampling times
-FIRST_ORDER = ProcessStructure(1, delay=False)
 ROWS = 8  # samples per column, at least
 
 
@@ -111,9 +109,11 @@ def _columns(u: Array, signals: RecordSignals, told: Informativity, o: int) -> A
 
 def _columns_in_time(u: Array, signals: RecordSignals, t: Array) -> Array:
     """Return the inputs behind the bank at irregular times (N,), in mean sampling times; the responses are exact."""
+    from optid.models.process_dynamics import ProcessDynamics, ProcessStructure  # numba
+
     found = [x for c in range(u.shape[1]) for x in powers(u[:, c], signals.levels(c))]
     whole = np.column_stack(found)
-    bank = (ProcessDynamics(FIRST_ORDER, np.array([tau])) for tau in TAUS if tau)
+    bank = (ProcessDynamics(ProcessStructure(1, delay=False), np.array([tau])) for tau in TAUS if tau)
     return np.hstack([whole, *(one.response(t, t, whole - whole[0])[:, 0] for one in bank)])
 
 
