@@ -22,6 +22,7 @@ from state_space import slow_input, tanks
 
 import optid
 from optid.bases import BSpline
+from optid.data.channels import Transform
 from optid.identify.prediction_error.descent import descend
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.statistics.expansion import expand
@@ -59,7 +60,7 @@ def model(n: int, m: int, l: int, latent: int, samples: int) -> tuple[StateError
         tuple(rng.normal(size=one.size) for _ in range(latent)), 0.02 * rng.normal(size=(n, latent)),
         0.02 * rng.normal(size=(l, latent)), 0.2 * rng.normal(size=(latent, n)), 0.1 * rng.normal(size=(latent, m)),
         np.zeros(latent))
-    errors = StateErrors(optid.Data(u, rng.normal(size=(samples, l))), unknowns, np.eye(l))
+    errors = StateErrors(optid.Data(u, rng.normal(size=(samples, l))), unknowns, np.eye(l), Transform.identity(m, l))
     x = errors.normalise(unknowns.pack(point))
     y = np.asarray(errors.at(unknowns.unpack(x)).simulate(errors.data, x0=np.zeros(n)))
     record = optid.Data(u, y + 0.01 * y.std() * rng.normal(size=y.shape))

@@ -19,7 +19,7 @@ from optid.workbench.request import suggest_state
 from optid.workbench.server import Server
 
 HOME = Path(__file__).parent
-sys.path.insert(0, str(HOME.parent / "tests"))
+sys.path.insert(0, str(HOME.parent / "tests" / "helpers"))
 
 from browser import Browser  # noqa: E402
 

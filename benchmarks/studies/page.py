@@ -15,7 +15,7 @@ from pathlib import Path
 
 from optid.studies import conclude
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "helpers"))
 from browser import CHROMIUM, NO_BROWSER, Browser
 from study_rows import rows as synthetic
 
