@@ -70,7 +70,7 @@ def model(n: int, m: int, l: int, latent: int, samples: int) -> tuple[StateError
 def linearisation(size: tuple[int, int, int, int], samples: int = 20_000) -> tuple[float, float]:
     """CPU microseconds a sample of the sensitivities, and of these with J'J; the best of five."""
     errors, x = model(*size, samples)
-    blocks, spent = errors.blocks(x), np.empty((6, 2))
+    blocks, spent = errors.rows(x), np.empty((6, 2))
     for row in spent:
         started = time.process_time()
         for _ in blocks(0):
