@@ -54,7 +54,7 @@ CASES = {
 LOOSE = {  # with the accuracy of semidefinite programmes, and of a likelihood
     "nuclear": ("hammerstein_arx.nuclear", ARX | HATS, curve, 1e-7),
     "subspace.nuclear": ("subspace.nuclear", STATES | {"weight": 30.0}, None, 1e-7),
-    "poles": ("hammerstein_ss.sid", STATES | CUBIC, poles, 1e-7), "fir": ("fir", {"nb": 10}, None, 1e-6),
+    "poles": ("hammerstein_ss.sid", STATES | CUBIC, poles, 1e-7), "fir": ("fir", {"nb": 10}, None, 1e-7),
 }
 # units stand in the user's equations, or descents are long: tested beside these formulations
 ELSEWHERE = {"physical", "lfr.shooting", "lfr.exact", "wiener_ss.exact", "hammerstein_wiener_ss.exact"}
