@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from html import escape
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -155,22 +156,11 @@ def test_modules_list_public_names_only(name):
     assert all(hasattr(module, one) for one in listed)
 
 
-def test_the_stub_for_editors_is_that_of_the_signatures():
-    sys.path.insert(0, "docs")
-    try:
-        from stub import STUB, stub
-    finally:
-        sys.path.remove("docs")
-    assert STUB.read_text(encoding="utf-8") == stub(), "run python docs/stub.py"
-
-
-def test_the_page_on_mathematics_is_that_of_the_formulations():
-    sys.path.insert(0, "docs")
-    try:
-        from mathematics import PAGE, page
-    finally:
-        sys.path.remove("docs")
-    assert PAGE.read_text(encoding="utf-8") == page(), "run python docs/mathematics.py"
+@pytest.mark.parametrize(("script", "path", "text"), [("stub", "STUB", "stub"), ("mathematics", "PAGE", "page")])
+def test_what_docs_write_from_the_code_is_up_to_date(script, path, text, monkeypatch):
+    monkeypatch.syspath_prepend("docs")
+    module = import_module(script)
+    assert getattr(module, path).read_text(encoding="utf-8") == getattr(module, text)(), f"run python docs/{script}.py"
 
 
 def test_a_notebook_shows_a_record_and_a_verdict_as_tables():

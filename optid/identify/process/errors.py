@@ -22,8 +22,7 @@ from optid.bases import Basis, Linear
 from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
 from optid.identify.prediction_error.compressed_errors import CompressedErrors
-from optid.identify.prediction_error.descent import Criterion
-from optid.identify.prediction_error.tangent_fit import Places
+from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.process.unknowns import ProcessUnknowns
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.process import ProcessModel
@@ -335,7 +334,7 @@ class ProcessErrors(Criterion):
     def model(self, values: Mapping[str, Array]) -> ProcessModel:
         """Return the model of named values in the units of the record."""
         u, dt, data = self.unknowns, self.data.dt, self.data
-        processes = tuple(one.in_unit(1 / dt) for one in self.processes(Places.of(self).pack(values)))
+        processes = tuple(one.in_unit(1 / dt) for one in self.processes(self.variables.pack(values)))
         curves = tuple(Nonlinearity(self.bases[c], np.atleast_1d(values[self.key("mu", p)]))
                        for p, (_, c) in enumerate(u.pairs))
         states = np.reshape(values.get("x0", np.zeros(0)), (-1, u.experiments), order="F")

@@ -65,7 +65,7 @@ def _interval(best: ProcessPoint, box: ProcessBox, place: int, level: float, col
 
 def _end(best: ProcessPoint, box: ProcessBox, place: int, step: float, most: float) -> float:
     """Return where the profile reaches a value on the side of a step, or the bound of the box."""
-    from scipy.optimize import brentq
+    from scipy.optimize import root_scalar
 
     here = best
 
@@ -79,8 +79,8 @@ def _end(best: ProcessPoint, box: ProcessBox, place: int, step: float, most: flo
     for _ in range(DOUBLINGS):
         outside = float(np.clip(inside + step, box.low[place], box.high[place]))
         if excess(outside) > 0:
-            solve: object = brentq
-            return float(solve(excess, inside, outside, xtol=EXACT * abs(step), rtol=1e-12))  # type: ignore[operator]
+            return float(root_scalar(excess, method="brentq", bracket=(inside, outside), xtol=EXACT * abs(step),
+                                     rtol=1e-12).root)
         inside, step = outside, 1.5 * step
         if outside == bound:
             break
