@@ -29,7 +29,6 @@ from optid.core.problem import Problem
 from optid.core.terms import Errors
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.fit import fit_processes
 from optid.identify.process.record import Terms, process_errors
@@ -85,7 +84,7 @@ process.takes_any_times = True
 
 def _problem(errors: ProcessErrors, x: Array) -> Problem:
     """Minimise ‖e‖² over the numbers of all processes, the static curves and the levels."""
-    places, data = Places.of(errors), errors.data
+    places, data = errors.variables, errors.data
     return Problem(
         "process.exact",
         start=places.values(x),

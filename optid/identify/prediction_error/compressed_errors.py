@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.core.terms import Values
-from optid.data.channels import Transform
 from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.prediction_error.error_noise import ErrorNoise
 from optid.identify.prediction_error.state_errors import StateErrors
@@ -155,11 +154,6 @@ class CompressedStates(CompressedErrors):
 
     criterion: StateErrors
     fixed: bool = False  # whether the programme fixes by rows what changes no output
-
-    @property
-    def outward(self) -> Transform:
-        """From the units of the programme's models to those of the record."""
-        return self.criterion.units
 
     def settle(self, values: Values) -> None:
         """Linearise the errors again, at values of the unknowns."""

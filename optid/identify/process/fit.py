@@ -13,7 +13,7 @@ from optid.core.problem import Problem
 from optid.identify.arguments import enough_rows
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import CONFIRMED, refine
-from optid.identify.prediction_error.tangent_fit import INSIDE, Places, TangentFit
+from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
 from optid.identify.process.descent import (
     LONG,
     ProcessBox,
@@ -128,7 +128,7 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[ProcessErrors, Array], 
         end = yield from fit.refine(within, start, dict(figures))
         if end is None:
             return None
-        at = Places.of(errors).pack(end.values or {})
+        at = errors.variables.pack(end.values or {})
         ends.append((TangentFit(within, errors, errors.compress).excess(at) > INSIDE, end.objective, at))
     return (yield from fit.confirm(min(ends, key=lambda one: one[:2])[2], figures))
 
@@ -237,7 +237,7 @@ def _usual(errors: ProcessErrors) -> tuple[Array, Array]:
 
 def _cell(errors: ProcessErrors, view: Any) -> dict[str, Any]:
     """Keep every dead time in its cell about the point where the constraints are read, other numbers at usual sizes."""
-    places = Places.of(errors)
+    places = errors.variables
     x = places.pack({name: view.reference[name] for name in places.names})
     low, high = _usual(errors)
     for p, place in errors.unknowns.delays.items():
