@@ -252,8 +252,7 @@ def _by_bounds(seen: RecordSearch) -> tuple[Ranking, bool]:
     record, part = seen.record, seen.part
     stretch = Data(part.u, part.y, record.dt, record.inputs, record.outputs, start=part.start).window(start, stop)
     found = solve_registered("fault.membership", seen.dictionary.model, stretch, faults=seen.dictionary,
-                             candidates=False,
-                   solver=seen.asked.solver)
+                             candidates=False, solver=seen.asked.solver)
     where = f"samples {start} to {stop - 1}"
     if not found.impossible:
         factor = f"{found.factor:.2f}" if np.isfinite(found.factor) else "unknown"
