@@ -234,11 +234,9 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
         RankError: parameters without effect on the predictions.
     """
     check_probability(level, "level")
-    transforms = [getattr(fit.program.compressed, "outward", None), getattr(fit.data, "transform", None)]
-
     def rebuild(values: dict[str, Array]) -> Any:
         model = fit.program.recover(values)
-        for transform in filter(None, transforms):
+        for transform in filter(None, (fit.program.compressed.outward, getattr(fit.data, "transform", None))):
             model = model.with_transform(transform)
         return align_signs(model, fit.model)
 

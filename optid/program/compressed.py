@@ -3,7 +3,8 @@
 Such a compressed record, `optid.core.problem.Problem.compressed`, has the ``problem``, ``‖root z - target‖² +
 remainder``; its ``statistics``, the factor ``root`` of [regressor | outputs] with its number of ``rows``,
 ``candidates``, and ``constants`` eliminated, its ``condition`` and ``method``; and the ``energy`` (l,) of the outputs
-in units of the objective. Its methods are ``lift(values)``, z; ``one_step_fit(values)`` (l,) in %, or None; and
+in units of the objective; and ``outward``, what leads from the units of the programme's models to those of the record,
+or None. Its methods are ``lift(values)``, z; ``one_step_fit(values)`` (l,) in %, or None; and
 ``spread(z, moves)``, moves (n, k) the derivatives of z by coordinates in which the information is the identity.
 """
 

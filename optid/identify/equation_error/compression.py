@@ -7,7 +7,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -49,6 +49,7 @@ class EquationError:
     between: np.ndarray | float = 0.0  # (l,) sum of squares of the mean outputs of the experiments about their mean
     # takes the statistics of every experiment, of a record of several without weights
     parts: Callable[[], list[Statistics]] | None = None
+    outward: ClassVar[None] = None  # its models are those of the record
 
     @property
     def layout(self) -> Layout:

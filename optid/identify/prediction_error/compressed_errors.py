@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.core.terms import Values
+from optid.data.channels import Transform
 from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.prediction_error.error_noise import ErrorNoise
 from optid.identify.prediction_error.state_errors import StateErrors
@@ -78,6 +79,11 @@ class CompressedErrors:
     def condition(self) -> float:
         """Condition number of the scaled sensitivities."""
         return self.at.condition
+
+    @property
+    def outward(self) -> Transform | None:
+        """What leads from the units of the models of the criterion to those of the record; None where they are one."""
+        return None
 
     @property
     def columns(self) -> NDArray[np.intp]:
@@ -154,6 +160,11 @@ class CompressedStates(CompressedErrors):
 
     criterion: StateErrors
     fixed: bool = False  # whether the programme fixes by rows what changes no output
+
+    @property
+    def outward(self) -> Transform | None:
+        """What leads from the units of the models of the criterion to those of the record."""
+        return self.criterion.units
 
     def settle(self, values: Values) -> None:
         """Linearise the errors again, at values of the unknowns."""
