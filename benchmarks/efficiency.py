@@ -16,7 +16,7 @@ from montecarlo import STRUCTURE, TRUTHS, A, B, mapped, noise_level, record
 from scipy.linalg import null_space
 
 import optid
-from optid.identify.equation_error import compress
+from optid.identify.equation_error import EquationStructure, compress
 
 VALUES = TRUTHS["dead zone"]
 MU = np.delete(VALUES, 4) - VALUES[4]
@@ -47,7 +47,7 @@ def split_objectives(problem) -> tuple[float, float]:
 def run(job: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     n, seed = job
     fit = optid.fit(record(VALUES, n, seed), prove=False, **STRUCTURE)
-    model, problem = fit.model, compress(fit.data, own=False, nk=0, **STRUCTURE).problem
+    model, problem = fit.model, compress(fit.data, EquationStructure(nk=0, **STRUCTURE), own=False).problem
     estimate = np.concatenate([model.a, model.offset, model.nonlinearities[0].mu, model.b[0]])
     return estimate - TRUTH, bound(problem), np.array([fit.solution.objective, *split_objectives(problem)])
 

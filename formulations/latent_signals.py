@@ -62,7 +62,7 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
     """
     extend = latent_channels(channels, latent_basis, latent, direct, seed, iterations, tries)
     return state_space_fit(
-        "lfr.exact", data, nx, basis=basis, criterion=criterion, block_rows=block_rows,
+        "lfr.exact", data, nx=nx, basis=basis, criterion=criterion, block_rows=block_rows,
         weighting=weighting, offset=offset, feedthrough=feedthrough, stability=stability, initial=initial,
         iterations=iterations, constraints=constraints, extend=extend, pose=_problem)
 
@@ -110,7 +110,7 @@ def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomi
 def _of_outputs(name: str, data: Data, nx: int | str, output_basis: Any, feedthrough: bool, iterations: int,
                 **settings: Any) -> Procedure:
     extend = output_functions(output_basis, in_memory(data, "simulation errors").l, feedthrough, iterations)
-    return state_space_fit(name, data, nx, criterion="simulation", feedthrough=feedthrough, iterations=iterations,
+    return state_space_fit(name, data, nx=nx, criterion="simulation", feedthrough=feedthrough, iterations=iterations,
                            extend=extend, pose=_problem, **settings)
 
 

@@ -38,7 +38,7 @@ from optid.core.problem import Problem
 from optid.core.terms import Errors
 from optid.data.record import Data
 from optid.identify.gauges import Gauge
-from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
+from optid.identify.prediction_error.transfer_errors import TransferErrors, TransferOrders, transfer_errors
 from optid.identify.prediction_error.transfer_fit import fit_transfer
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
@@ -77,8 +77,8 @@ def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: 
         RankError: too few samples for the unknowns, a basis function that no sample excites, or inputs that the record
             does not tell apart.
     """
-    return _procedure("hammerstein_bj.exact", data, na, nb, nk, basis, nc, nd,
-                      constraints, gauge, offset, starts, seed)
+    errors = transfer_errors(data, TransferOrders(na, nb, nk, nc, nd), basis, gauge, offset)
+    return _procedure("hammerstein_bj.exact", errors, constraints, starts, seed)
 
 
 @steps(lambda given: {"bj.exact": "QP" if given["constraints"] else "QP linear"})
@@ -89,8 +89,8 @@ def bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, nk: Orders = 0, con
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are
     the errors raised.
     """
-    return _procedure("bj.exact", data, na, nb, nk, "linear", nc, nd, constraints, None, offset,
-                      starts, seed)
+    errors = transfer_errors(data, TransferOrders(na, nb, nk, nc, nd), "linear", None, offset)
+    return _procedure("bj.exact", errors, constraints, starts, seed)
 
 
 @steps(lambda given: {"hammerstein_oe.exact": "QP" if given["constraints"] else "QP linear"})
@@ -102,7 +102,8 @@ def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomia
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are the
     errors raised.
     """
-    return _procedure("hammerstein_oe.exact", data, na, nb, nk, basis, 0, 0, constraints, gauge, offset, starts, seed)
+    errors = transfer_errors(data, TransferOrders(na, nb, nk, 0, 0), basis, gauge, offset)
+    return _procedure("hammerstein_oe.exact", errors, constraints, starts, seed)
 
 
 @steps(lambda given: {"oe.exact": "QP" if given["constraints"] else "QP linear"})
@@ -113,7 +114,8 @@ def oe(data: Data, *, na: int, nb: Orders, nk: Orders = 0, constraints: Sequence
     Named variables: ``Theta``, ``a``, ``b``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are the errors
     raised.
     """
-    return _procedure("oe.exact", data, na, nb, nk, "linear", 0, 0, constraints, None, offset, starts, seed)
+    errors = transfer_errors(data, TransferOrders(na, nb, nk, 0, 0), "linear", None, offset)
+    return _procedure("oe.exact", errors, constraints, starts, seed)
 
 
 @steps(lambda given: {"hammerstein_armax.exact": "QP" if given["constraints"] else "QP linear"})
@@ -125,8 +127,8 @@ def hammerstein_armax(data: Data, *, na: int, nb: Orders, nc: int, basis: Bases 
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``mu``, ``offset``. Arguments as in `hammerstein_bj`, as are the
     errors raised, except for that of a record without stretches.
     """
-    return _procedure("hammerstein_armax.exact", data, na, nb, nk, basis, nc, None, constraints, gauge, offset, starts,
-                      seed)
+    errors = transfer_errors(data, TransferOrders(na, nb, nk, nc, None), basis, gauge, offset)
+    return _procedure("hammerstein_armax.exact", errors, constraints, starts, seed)
 
 
 @steps(lambda given: {"armax.exact": "QP" if given["constraints"] else "QP linear"})
@@ -137,12 +139,11 @@ def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constrain
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``offset``. Arguments as in `hammerstein_armax`, as are the errors
     raised.
     """
-    return _procedure("armax.exact", data, na, nb, nk, "linear", nc, None, constraints, None, offset, starts, seed)
+    errors = transfer_errors(data, TransferOrders(na, nb, nk, nc, None), "linear", None, offset)
+    return _procedure("armax.exact", errors, constraints, starts, seed)
 
 
-def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
-               constraints: Sequence[Any], gauge: str | None, offset: Any, starts: Any, seed: int) -> Procedure:
-    errors = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
+def _procedure(name: str, errors: TransferErrors, constraints: Sequence[Any], starts: int, seed: int) -> Procedure:
     errors = replace(errors, integrates=asks_for_integrator(constraints))
     return (yield from fit_transfer(errors, starts, seed, lambda x: _problem(name, errors, x).subject_to(*constraints)))
 

@@ -90,7 +90,7 @@ def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomia
 
 def _of_states(name: str, data: Data, nx: int | str, constraints: Sequence[Any], **settings: Any) -> Procedure:
     check_states(name, data, constraints)
-    return state_space_fit(f"{name}.shooting", data, nx, criterion="simulation", constraints=constraints,
+    return state_space_fit(f"{name}.shooting", data, nx=nx, criterion="simulation", constraints=constraints,
                            finish=partial(shoot, _problem), **settings)
 
 

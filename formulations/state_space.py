@@ -87,7 +87,7 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
         RankError: too few samples for the unknowns, or a feedback basis that is linear in y.
     """
     return state_space_fit(
-        "hammerstein_ss.exact", data, nx, basis=basis, feedback_basis=feedback_basis,
+        "hammerstein_ss.exact", data, nx=nx, basis=basis, feedback_basis=feedback_basis,
         criterion=criterion, block_rows=block_rows, weighting=weighting, offset=offset, feedthrough=feedthrough,
         stability=stability, initial=initial, iterations=iterations, constraints=constraints)
 
@@ -103,7 +103,7 @@ def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: 
     `hammerstein_ss`, as are the errors raised.
     """
     return state_space_fit(
-        "ss.exact", data, nx, criterion=criterion, block_rows=block_rows, weighting=weighting,
+        "ss.exact", data, nx=nx, criterion=criterion, block_rows=block_rows, weighting=weighting,
         offset=offset, feedthrough=feedthrough, stability=stability, initial=initial, iterations=iterations,
         constraints=constraints)
 
@@ -143,8 +143,8 @@ def signals(errors: StateErrors, variables: Mapping[str, Any], x: Values) -> dic
     return found
 
 
-def state_space_fit(name: str, data: Data, nx: int | str, *, constraints: Sequence[Any], pose: Any = _problem,
-                    **settings: Any) -> Procedure:
+def state_space_fit(name: str, data: Data, *, constraints: Sequence[Any], pose: Any = _problem, **settings: Any
+                    ) -> Procedure:
     """Fit a model in the units of the samples, and return it in those of the record; see `fit_states`."""
     refuse_integrator(constraints, NO_EQUATION)
-    return fit_states(name, data, nx, constraints=constraints, pose=pose, subspace=SUBSPACE, **settings)
+    return fit_states(name, data, constraints=constraints, pose=pose, subspace=SUBSPACE, **settings)

@@ -13,7 +13,7 @@ errors below it, and a free run feeds its own outputs back, for which phi is not
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -56,9 +56,16 @@ class HankelBounds:
         return Bound(value, False, f"Hankel matrix, {rows} block rows", reason, multipliers=self)
 
 
-def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Sequence[int], outputs: Sequence[int],
-                  block_rows: Sequence[int], feedback: Sequence[int] = (), largest: int = 10,
-                  weights: Array | None = None) -> HankelBounds:
+class SignalPlaces(NamedTuple):
+    """Positions among the signals."""
+
+    inputs: Sequence[int]  # of the functions of the inputs
+    outputs: Sequence[int]
+    feedback: Sequence[int] = ()  # of the functions of the outputs that are fed back
+
+
+def hankel_bounds(records: Sequence[Array], expand: Expand | None, places: SignalPlaces, *, block_rows: Sequence[int],
+                  largest: int = 10, weights: Array | None = None) -> HankelBounds:
     """Bound the simulation error of every model of order 0 to ``largest``.
 
     Windows that touch a missing sample are left out, which keeps the bound valid for the remaining samples.
@@ -66,11 +73,8 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
     Args:
         records: one array (N, c) of raw channels per experiment, NaN = missing.
         expand: raw channels -> signals, as in `optid.statistics.hankel.hankel_statistics`; None for the channels.
-        inputs: positions of the functions of the inputs among the signals.
-        outputs: positions of the outputs.
+        places: of the signals; a linear function of the outputs among those that are fed back makes the bound zero.
         block_rows: the alphas to try.
-        feedback: positions of the functions of the outputs that are fed back; a linear function of the outputs among
-            them makes the bound zero.
         largest: largest order of interest.
         weights: (l,) by which the outputs are multiplied in the error.
 
@@ -81,6 +85,7 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
     tried = tuple(sorted({int(a) for a in block_rows}))
     if not tried or tried[0] < 2:
         raise StructureError(f"the bound needs at least two block rows; got {block_rows!r}")
+    inputs, outputs, feedback = places
     scales = np.ones(len(outputs)) if weights is None else np.asarray(weights, dtype=float)
     values, energy = np.zeros((len(tried), largest + 1)), -1.0
     centre: Any = "mean"
@@ -105,7 +110,7 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
 
 
 def simulation_bound(records: Sequence[Array], expansion: Expansion, n: int, weights: Array, error: float,
-                     block_rows: int, said: str, applies: bool = True) -> Bound:
+                     block_rows: int, said: str) -> Bound:
     """Return the bound that holds for every model of the order with these functions, or none with the reason.
 
     Args:
@@ -116,10 +121,7 @@ def simulation_bound(records: Sequence[Array], expansion: Expansion, n: int, wei
         error: its value, a squared error of the simulator with measured feedback.
         block_rows: of the fit; the bound is the best of one, two and four times as many.
         said: what else there is to say about optimality.
-        applies: whether no observer gain corrects the state and no instruments stand for the feedback.
     """
-    if not applies:
-        return Bound.none(f"{said}; its objective is no simulation error, which the Hankel bound is about")
     x = expansion.with_simulated(False)
     count, signals = sum(len(record) for record in records), x.p + x.q + x.l
     longest = max(len(record) for record in records)
@@ -128,7 +130,7 @@ def simulation_bound(records: Sequence[Array], expansion: Expansion, n: int, wei
     if not tried:
         return Bound.none(said)
     try:
-        found = hankel_bounds(records, x, inputs=x.eta, feedback=x.zeta, outputs=x.y, largest=n, block_rows=tried,
+        found = hankel_bounds(records, x, SignalPlaces(x.eta, x.y, x.zeta), block_rows=tried, largest=n,
                               weights=weights).bound(n, error)
     except OptidError as reason:
         return Bound.none(f"{said}; no Hankel bound: {reason}")

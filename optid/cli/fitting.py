@@ -3,7 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import typer
 
@@ -13,6 +13,17 @@ from optid.cli.results import Work, check_names, reading_for, save_model, solver
 from optid.cli.terminal import STOPPED
 from optid.errors import DataError
 from optid.lazy import import_cvxpy
+
+
+class _Given(NamedTuple):
+    """Options about the record of a search."""
+
+    data: Paths
+    example: str | None
+    how: dict[str, Any]
+    seed: int
+    split: float | None
+    test: Words
 
 
 def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], stream: bool = False,
@@ -43,7 +54,7 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
     check_names(constraint, solver, formulation)
     asked = (holdout, settings, option, time_limit, scheduler)
     if data and formulation == DEFAULT and not stream and all(word is None for word in asked):
-        _search(data, example, how, seed, split, test, constraint, solver, saved, report, accuracy=accuracy)
+        _search(_Given(data, example, how, seed, split, test), constraint, solver, saved, report, accuracy=accuracy)
         return
     with working(saved, report) as work:
         from optid.cli import arguments as words
@@ -95,24 +106,24 @@ def identify(data: Paths = None, example: str | None = None, *, how: dict[str, A
     The record:
         split (SHARE): Search on this share of the record and validate on the rest.
     """
-    _search(data, example, how, seed, split, test, constraint, solver, saved, report, effort=effort, budget=budget,
-            horizon=horizon, workers=workers, trials=trials, **({"classes": classes} if classes else {}))
+    _search(_Given(data, example, how, seed, split, test), constraint, solver, saved, report, effort=effort,
+            budget=budget, horizon=horizon, workers=workers, trials=trials, **({"classes": classes} if classes else {}))
 
 
-def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: Words,
-            constraint: Words, solver: str, saved: File, report: File, **settings: Any) -> None:
+def _search(given: _Given, constraint: Words, solver: str, saved: File, report: File, **settings: Any) -> None:
     check_names(constraint, solver)
     with working(saved, report) as work:
         from optid.cli import arguments as words
 
+        data, how = given.data, given.how
         if data:
             how = words.at_stamps(how)
-        record: Any = words.record(data, how, example, seed)[0]
+        record: Any = words.record(data, how, given.example, given.seed)[0]
         import_cvxpy()
         from optid.identify.search.search import INTERRUPT
         from optid.identify.search.search import identify as find
 
-        record, held_out = words.held_out(record, split, test, how)
+        record, held_out = words.held_out(record, given.split, given.test, how)
         found = find(record, constraints=constraint or (), solver=solver, progress=work.step, **settings)
         _save(work, found, held_out, saved, data, how)
         work.text = str(found)

@@ -13,7 +13,7 @@ import numpy as np
 from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.equation_error import EquationError, compress
+from optid.identify.equation_error import EquationError, EquationStructure, compress
 
 FLOOR = 1e-12  # residual standard deviation, as a share of that of the output, that counts as zero
 
@@ -61,7 +61,7 @@ def level_evidence(data: Data, *, na: int = 4, nb: int | Sequence[int] = 4, nk: 
     """
     if isinstance(data, Data) and data.n_experiments == 1:
         raise StructureError("the record has one experiment, so that it has one level")
-    one, each = (compress(data, na=na, nb=nb, nk=nk, basis=basis, offset=offset) for offset in (True, "each"))
+    one, each = (compress(data, EquationStructure(na, nb, nk, basis, offset=offset)) for offset in (True, "each"))
     return LevelEvidence(_criterion(one), _criterion(each), data.n_experiments)
 
 

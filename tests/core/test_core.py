@@ -15,7 +15,7 @@ from optid.core.problem import Problem
 from optid.core.program import as_program
 from optid.core.terms import Errors, GroupNorms, Inner, Length, NuclearNorms, Squares, flat
 from optid.errors import StructureError
-from optid.identify.equation_error import compress
+from optid.identify.equation_error import EquationStructure, compress
 from optid.program.solution import Status
 from optid.registry import named_constraint
 
@@ -133,7 +133,7 @@ def record(seed=0, n=120, m=1):
 
 
 def exact_problem(seed, words=(), m=1):
-    compressed = compress(record(seed, m=m), na=2, nb=2, nk=1, basis="triangular:6")
+    compressed = compress(record(seed, m=m), EquationStructure(2, 2, 1, "triangular:6"))
     return _factored(compressed, tuple(named_constraint(w) if isinstance(w, str) else w for w in words), "norm")
 
 

@@ -16,7 +16,7 @@ from optid.core.problem import Problem
 from optid.core.program import as_program
 from optid.core.terms import GroupNorms, NuclearNorms, Squares
 from optid.errors import DataWarning, StructureError
-from optid.identify.equation_error import compress
+from optid.identify.equation_error import EquationStructure, compress
 from optid.program.solution import relative_gap
 from optid.registry import named_constraint
 from optid.solving.solve import solve
@@ -56,7 +56,7 @@ def test_degenerate_multipliers_are_priced_by_the_least():
     def twice(v):
         return {"one": v["a"][0] <= -1.0, "same": 2 * v["a"][0] <= -2.0, "idle": v["a"][1] >= -50}
 
-    problem = arx_problem(compress(RECORD, na=2, nb=2, nk=1, basis="linear"), (twice,))
+    problem = arx_problem(compress(RECORD, EquationStructure(2, 2, 1, "linear")), (twice,))
     x, solution = solved(problem)
     judged = judge(problem, x, solution.duals)
     prices = {p.name: p.multiplier for p in price_constraints(problem, x, judged.duals, judged.objective)}
@@ -94,7 +94,7 @@ def test_a_constraint_on_one_factor_has_a_multiplier_of_the_gauge_beside_it():
 
 def test_multipliers_are_the_rates_of_the_optimum():
     def optimum(high):
-        problem = arx_problem(compress(RECORD, na=2, nb=2, nk=1, basis="linear"),
+        problem = arx_problem(compress(RECORD, EquationStructure(2, 2, 1, "linear")),
                               (lambda v: {"high": v["a"][0] <= high},))
         x, solution = solved(problem)
         return solution.objective, judge(problem, x, {}), problem

@@ -17,7 +17,7 @@ from optid.errors import StructureError
 from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.static_curve import static_curve
 from optid.identify.prediction_error.tangent_fit import TangentFit
-from optid.identify.prediction_error.transfer_errors import transfer_errors
+from optid.identify.prediction_error.transfer_errors import TransferOrders, transfer_errors
 from optid.program.solution import Status
 
 pytestmark = pytest.mark.numerical
@@ -34,7 +34,7 @@ def record(seed, samples=200):
 
 def fit_of(seed, *builders, gauge="norm"):
     """The fit of an output-error model, and a point somewhere near an optimum."""
-    errors = transfer_errors(record(seed), 2, 2, 1, "polynomial:3", 0, 0, gauge, True)
+    errors = transfer_errors(record(seed), TransferOrders(2, 2, 1), "polynomial:3", gauge, True)
     rng = np.random.default_rng(seed)
     x = errors.normalise(np.concatenate([[-1.1, 0.3], rng.uniform(0.5, 1.5, errors.unknowns.size - 2)]))
     problem = transfer_problem("a test", errors, x).subject_to(*builders)

@@ -287,7 +287,7 @@ def test_results_by_name():
 
 @pytest.mark.parametrize(("changes", "error", "words"), [
     ({"nc": -1}, StructureError, "nc must be a nonnegative integer"),
-    ({"nc": 1.5}, StructureError, "nc=1.5: it must be an integer"),
+    ({"nc": 1.5}, StructureError, "nc must be a nonnegative integer; got 1.5"),
     ({"na": True}, StructureError, "na"),
     ({"nb": 0}, StructureError, "nb of input 'u'"),
     ({"starts": 0}, StructureError, "starts"),

@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 import optid
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.equation_error.compression import compress
+from optid.identify.equation_error.compression import EquationStructure, compress
 from optid.identify.equation_error.priors import KERNELS, families, kernel, likeliest
 
 G = lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.7], np.r_[1.0, np.zeros(99)])
@@ -27,7 +27,7 @@ def regressor(data, lags, nk=1):
 
 
 def statistics(data, lags, **changes):
-    return compress(data, na=0, nb=lags, nk=1, basis="linear", own=False, **changes).statistics
+    return compress(data, EquationStructure(0, lags, 1, "linear", **changes), own=False).statistics
 
 
 @pytest.mark.parametrize("word", KERNELS)

@@ -12,7 +12,7 @@ from formulations.constraints import shape
 from optid import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.identify.levels import level_evidence
-from optid.identify.prediction_error.transfer_errors import transfer_errors
+from optid.identify.prediction_error.transfer_errors import TransferOrders, transfer_errors
 from optid.program.solution import Status
 
 
@@ -179,7 +179,7 @@ def test_armax_with_levels_is_brute_force():
 @pytest.mark.parametrize(("nc", "nd"), [(0, 0), (1, 1), (1, None)])
 def test_sensitivities_to_levels_are_those_of_finite_differences(nc, nd):
     data, _ = record(4, experiments=3, samples=40)
-    criterion = transfer_errors(data, 1, 2, 1, "linear", nc, nd, None, "each")
+    criterion = transfer_errors(data, TransferOrders(1, 2, 1, nc, nd), "linear", None, "each")
     rng = np.random.default_rng(5)
     x = 0.1 * rng.standard_normal(criterion.unknowns.size)
     x[criterion.unknowns.slices["a"]] = -0.7

@@ -8,7 +8,7 @@ from refusals import refuses
 from scipy.optimize import least_squares
 
 import optid
-from optid.certificate.hankel import hankel_bounds
+from optid.certificate.hankel import SignalPlaces, hankel_bounds
 from optid.errors import RankError, StructureError
 
 
@@ -44,7 +44,7 @@ def test_no_random_model_beats_the_bound(n, seed, gaps):
             y[rng.integers(count, size=2), rng.integers(l, size=2)] = np.nan
         records.append(np.hstack([phi, y]))
         phis.append(phi)
-    bounds = hankel_bounds(records, None, inputs=range(m), outputs=range(m, m + l), largest=4, block_rows=(3, 5, 8))
+    bounds = hankel_bounds(records, None, SignalPlaces(range(m), range(m, m + l)), largest=4, block_rows=(3, 5, 8))
     for model in models:
         for _ in range(3):
             changed = [part + 0.05 * rng.normal(size=part.shape) for part in model]
@@ -65,7 +65,7 @@ def test_no_fitted_model_beats_the_bound(n):
     phi = rng.normal(size=(count, 1))
     truth = random_model(rng, 3, 1, 1)
     y = simulate(*truth, phi, rng.normal(size=3), np.zeros(3), np.array([2.0])) + 0.1 * rng.normal(size=(count, 1))
-    bounds = hankel_bounds([np.hstack([phi, y])], None, inputs=[0], outputs=[1], largest=3, block_rows=range(3, 20))
+    bounds = hankel_bounds([np.hstack([phi, y])], None, SignalPlaces([0], [1]), largest=3, block_rows=range(3, 20))
 
     def error(x):
         a, b, c = x[: n * n].reshape(n, n), x[n * n : n * n + n][:, None], x[n * n + n : n * n + 2 * n][None]
@@ -97,16 +97,18 @@ def test_feedback_from_measured_outputs_is_among_the_regressors():
     def expand(raw):
         return np.hstack([raw[:, :1], np.tanh(raw[:, 1:]), raw[:, 1:]])
 
-    arguments = {"inputs": [0], "feedback": [1], "outputs": [2], "block_rows": (4, 8, 15), "largest": 3}
-    bounds = hankel_bounds([raw], expand, **arguments)
+    def bounds_with(*feedback):
+        return hankel_bounds([raw], expand, SignalPlaces([0], [2], feedback), block_rows=(4, 8, 15), largest=3)
+
+    bounds = bounds_with(1)
     simulated = simulate(a, np.hstack([b, -e]), c, np.zeros((1, 2)), expand(raw)[:, :2], np.zeros(2), 0.0, 0.0)
     error = float(np.sum((y - simulated) ** 2))
     assert 0 < bounds.value(2)[0] <= error
     assert bounds.value(1)[0] > 1.5 * bounds.value(2)[0]
-    without = hankel_bounds([raw], expand, **{**arguments, "feedback": []})
+    without = bounds_with()
     assert np.all(without.values >= bounds.values - 1e-9)
     # a linear function of the output among the regressors leaves nothing to bound
-    assert hankel_bounds([raw], expand, **{**arguments, "feedback": [1, 2]}).value(0)[0] < 0.35 * bounds.value(0)[0]
+    assert bounds_with(1, 2).value(0)[0] < 0.35 * bounds.value(0)[0]
 
 
 def ar_plus_input(count=2000):
@@ -121,7 +123,7 @@ def ar_plus_input(count=2000):
 
 def test_one_step_errors_lie_below_the_bound_and_are_refused():
     u, y, e = ar_plus_input()
-    bounds = hankel_bounds([np.column_stack([u, y])], None, inputs=[0], outputs=[1], block_rows=(40,), largest=2)
+    bounds = hankel_bounds([np.column_stack([u, y])], None, SignalPlaces([0], [1]), block_rows=(40,), largest=2)
     one_step = float(np.sum(e[1:] ** 2))
     assert bounds.value(1)[0] > 1.5 * one_step  # the counterexample: it is no bound on that error
     refuses(StructureError, "was not measured by the simulator", bounds.bound, 1, one_step)
@@ -134,7 +136,7 @@ def test_one_step_errors_lie_below_the_bound_and_are_refused():
 
 def test_certificate_of_a_fit():
     rng = np.random.default_rng(1)
-    bounds = hankel_bounds([rng.normal(size=(200, 3))], None, inputs=[0], feedback=[1], outputs=[2], largest=2,
+    bounds = hankel_bounds([rng.normal(size=(200, 3))], None, SignalPlaces([0], [2], [1]), largest=2,
                            block_rows=(4, 8, 16))
     found = bounds.bound(1, 500.0)
     assert found.value == bounds.value(1)[0] and found.method.startswith("Hankel") and not found.proved
@@ -143,8 +145,8 @@ def test_certificate_of_a_fit():
 def test_weights_and_units():
     rng = np.random.default_rng(2)
     raw = rng.normal(size=(150, 3))
-    plain = hankel_bounds([raw], None, inputs=[0], outputs=[1, 2], block_rows=(5,), largest=2)
-    scaled = hankel_bounds([raw * [1, 10, 0.1] + [0, 1e3, -5]], None, inputs=[0], outputs=[1, 2], block_rows=(5,),
+    plain = hankel_bounds([raw], None, SignalPlaces([0], [1, 2]), block_rows=(5,), largest=2)
+    scaled = hankel_bounds([raw * [1, 10, 0.1] + [0, 1e3, -5]], None, SignalPlaces([0], [1, 2]), block_rows=(5,),
                            largest=2, weights=np.array([0.1, 10.0]))
     assert np.allclose(plain.values, scaled.values, rtol=1e-6)
 
@@ -153,15 +155,15 @@ def test_exact_data_are_bounded_by_nothing():
     rng = np.random.default_rng(3)
     phi = rng.normal(size=(300, 1))
     y = simulate(*random_model(rng, 2, 1, 1), phi, np.ones(2), np.ones(2), np.ones(1))
-    bounds = hankel_bounds([np.hstack([phi, y])], None, inputs=[0], outputs=[1], largest=3, block_rows=(5, 10, 20))
+    bounds = hankel_bounds([np.hstack([phi, y])], None, SignalPlaces([0], [1]), largest=3, block_rows=(5, 10, 20))
     assert bounds.value(2)[0] <= 1e-9 * bounds.energy and bounds.value(1)[0] > 1e-6 * bounds.energy
     assert "order 1 cannot reach" in bounds.bound(2, 1e-9 * bounds.energy).reason
 
 
 @pytest.mark.parametrize("call, error, words", [
-    (lambda raw: hankel_bounds([raw], None, inputs=[0], outputs=[1], block_rows=(1,)), StructureError, "two block"),
-    (lambda raw: hankel_bounds([raw[:30]], None, inputs=[0], outputs=[1], block_rows=(20,)), RankError, "too few"),
-    (lambda raw: hankel_bounds([raw], None, inputs=[0], outputs=[1], largest=2, block_rows=(4,)).value(7),
+    (lambda raw: hankel_bounds([raw], None, SignalPlaces([0], [1]), block_rows=(1,)), StructureError, "two block"),
+    (lambda raw: hankel_bounds([raw[:30]], None, SignalPlaces([0], [1]), block_rows=(20,)), RankError, "too few"),
+    (lambda raw: hankel_bounds([raw], None, SignalPlaces([0], [1]), largest=2, block_rows=(4,)).value(7),
      StructureError, "0 to 2"),
 ])
 def test_bad_arguments(call, error, words):

@@ -5,6 +5,7 @@ What invalidates the result is an error, a weakness a warning.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -141,9 +142,18 @@ def _conditioned(rule: str, number: float, words: str, warning: str) -> Check:
 
 def many_lines(x: Array, most: int, tolerance: float) -> bool:
     """Whether x (N,) certainly needs more sinusoids to leave this share of its variance: a quick test by frequency."""
-    energy = np.sort(np.abs(np.fft.rfft((x - x.mean()) * np.hanning(x.size))) ** 2)[::-1]
+    spectrum = np.fft.rfft((x - x.mean()) * window_of(x.size))
+    energy, largest = spectrum.real**2 + spectrum.imag**2, min(most * LOBE, x.size // 2 + 1)
     # No choice of `most` lobes holds more than as many of the largest bins.
-    return bool(energy[: most * LOBE].sum() < (1 - tolerance) * energy.sum())
+    return bool(np.partition(energy, -largest)[-largest:].sum() < (1 - tolerance) * energy.sum())
+
+
+@lru_cache(maxsize=8)
+def window_of(size: int) -> Array:
+    """Return Hann's window, which is not to be written to."""
+    window = np.hanning(size)
+    window.flags.writeable = False
+    return window
 
 
 def remaining_shares(signals: Array, most: int, enough: float) -> Array:
@@ -159,7 +169,7 @@ def remaining_shares(signals: Array, most: int, enough: float) -> Array:
     if not x.shape[1]:
         return np.zeros(1)
     n, total = len(x), float(x.shape[1])
-    window, frequencies, residual = np.hanning(n)[:, None], np.zeros(0), x
+    window, frequencies, residual = window_of(n)[:, None], np.zeros(0), x
     while len(shares) <= most and shares[-1] > enough and 2 * len(shares) + 1 < n:
         frequencies = np.append(frequencies, _strongest(residual * window))
         for _ in range(STEPS if frequencies.size <= JOINT else 1):

@@ -203,35 +203,52 @@ class EquationError:
         return np.stack([a[:, i * ny : (i + 1) * ny] for i in range(na)]) if na else np.zeros((0, ny, ny))
 
 
-def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],
-             basis: Basis | str | Sequence[Basis | str], ridge: float = 0.0, curvature: float = 0.0,
-             weights: Sequence[np.ndarray] | None = None, own: bool = True, degree: int = 2, prior: str = "none",
-             offset: Offset = True) -> EquationError:
-    """Read the record once and return the compressed problem in the record's own units (`optid.program.units`).
+@dataclass(frozen=True)
+class EquationStructure:
+    """What is regressed on what.
 
-    Args:
-        data: the record.
+    Attributes:
         na: order of A.
         nb: number of numerator coefficients, one per input or one for all.
         nk: delay in samples, likewise.
         basis: likewise; a basis without interval takes the range of its input.
         ridge: weight of ``‖Theta‖²``.
         curvature: weight of the integral of ``f''²`` summed over the columns of Theta.
-        weights: nonnegative row weights per experiment, or None.
-        own: False for a record that is in its own units already.
-        degree: of the loss in the residuals: 2 for squares, 1 for the sum of magnitudes.
         prior: of the impulse responses, "none", "tc", "dc" or "ss", see `optid.identify.equation_error.priors`.
         offset: True for one constant, "each" for one for every experiment.
+        degree: of the loss in the residuals: 2 for squares, 1 for the sum of magnitudes.
+    """
+
+    na: int
+    nb: int | Sequence[int]
+    nk: int | Sequence[int]
+    basis: Basis | str | Sequence[Basis | str]
+    ridge: float = 0.0
+    curvature: float = 0.0
+    prior: str = "none"
+    offset: Offset = True
+    degree: int = 2
+
+
+def compress(data: Data | Stream, of: EquationStructure, *, weights: Sequence[np.ndarray] | None = None,
+             own: bool = True) -> EquationError:
+    """Read the record once and return the compressed problem in the record's own units (`optid.program.units`).
+
+    Args:
+        data: the record.
+        of: the regression.
+        weights: nonnegative row weights per experiment, or None.
+        own: False for a record that is in its own units already.
 
     Raises:
         StructureError: impossible orders, another offset.
         RankError: the record does not determine the parameters.
     """
     inputs, outputs = data.inputs, data.outputs
-    nbs = per_channel("nb", nb, inputs, low=1)
-    nks = per_channel("nk", nk, inputs, low=0)
-    order = check_integer(na, "na (the number of past outputs)", 0)
-    constants = check_offset(offset, data)
+    nbs = per_channel("nb", of.nb, inputs, low=1)
+    nks = per_channel("nk", of.nk, inputs, low=0)
+    order = check_integer(of.na, "na (the number of past outputs)", 0)
+    constants = check_offset(of.offset, data)
     if not constants:
         raise StructureError("offset=False: equation-error fits estimate the constant; hold it by "
                              "formulations.constraints.shape.fixed('offset', 0), or centre the record and use "
@@ -239,33 +256,33 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     shifts, means, between = None, None, 0.0
     if isinstance(data, Data) and constants == "each":
         data, shifts = remove_levels(data)
-    bases, before = fitted_bases(data, basis), data
+    bases, before = fitted_bases(data, of.basis), data
     units = Transform.identity(len(inputs), len(outputs))
     if own:
         units = own_units(data, [isinstance(one, Linear) for one in bases])
         data = in_units(data, units)
-    one_of("prior", prior, ("none", "tc", "dc", "ss"))
+    one_of("prior", of.prior, ("none", "tc", "dc", "ss"))
     layout = Layout(na=order, nb=nbs, nk=nks, bases=inner_bases(bases, units), outputs=tuple(outputs),
                     inputs=tuple(inputs))
-    check_weight(ridge, "ridge")
-    check_weight(curvature, "curvature")
+    check_weight(of.ridge, "ridge")
+    check_weight(of.curvature, "curvature")
     if shifts is not None and isinstance(data, Data):
         shifts = shifts / np.array(units.y_scale)
         statistics, means = collect_by_experiment(data, layout, weights)
         between = means.energy(shifts)
     else:
         statistics = collect(data, layout, weights=weights)
-    unit = units.y_scale[0] ** degree
+    unit = units.y_scale[0] ** of.degree
     share = energy_unit(units) / unit
     columns = positions(layout)
     rows = None
-    if prior != "none":
+    if of.prior != "none":
         from optid.identify.equation_error.priors import likeliest
 
-        rows = likeliest(prior, statistics).rows(columns)
+        rows = likeliest(of.prior, statistics).rows(columns)
     parts = partial(_parts, before, units, layout) if isinstance(before, Data) and weights is None and (
         before.n_experiments > 1) else None
-    problem = lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale, prior=rows)
+    problem = lifted_problem(statistics, columns, share * of.ridge, share * of.curvature, units.u_scale, prior=rows)
     return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit, means=means, shifts=shifts,
                          between=between, parts=parts)
 

@@ -24,7 +24,7 @@ from optid.data.levels import remove_levels
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError, nearest
-from optid.identify.equation_error.compression import EquationError, compress
+from optid.identify.equation_error.compression import EquationError, EquationStructure, compress
 from optid.identify.outliers import MOST, NORMAL_MEDIAN, find_additive_outliers, find_outliers
 from optid.identify.record_checks import BY_RESIDUALS, EXAMINED, LeftOut
 from optid.program.solution import Bound, Solution, Status, relative_gap
@@ -60,7 +60,7 @@ def parse_loss(loss: str) -> tuple[str, float]:
 
 
 def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError], Problem], *, convex: bool,
-                   **structure: Any) -> Any:
+                   **words: Any) -> Any:
     """Return the plain problem for squares, a procedure of reweighted programmes for the other losses.
 
     Args:
@@ -68,13 +68,13 @@ def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError
         data: the record.
         pose: states the problem of a compressed record.
         convex: whether a dual bound exists.
-        structure: of `compress`.
+        words: of an `EquationStructure`.
     """
     kind, threshold = parse_loss(loss)
-    structure["degree"] = 1 if kind == "l1" else 2
+    structure = EquationStructure(**words, degree=1 if kind == "l1" else 2)
     if kind == "squares":
-        return pose(compress(data, **structure))
-    if structure.get("prior", "none") != "none":
+        return pose(compress(data, structure))
+    if structure.prior != "none":
         raise StructureError(f"loss {loss!r}: a prior takes its strength from the likelihood of Gaussian noise; use "
                              "loss='squares', or prior='none' with a ridge")
     if isinstance(data, Stream):
@@ -83,9 +83,9 @@ def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError
     return _reweighted(data, pose, structure, kind, threshold, convex)
 
 
-def _reweighted(data: Data, pose: Callable[[EquationError], Problem], structure: dict[str, Any], kind: str,
+def _reweighted(data: Data, pose: Callable[[EquationError], Problem], structure: EquationStructure, kind: str,
                 threshold: float, convex: bool) -> Procedure:
-    whole = compress(data, **structure)
+    whole = compress(data, structure)
     record = data if whole.shifts is None else remove_levels(data)[0]
     used = _Rows(in_units(record, whole.units), whole.layout)
     problem, base = whole, as_program(pose(whole), step=True)
@@ -94,13 +94,13 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Problem], structure:
     def weighted_program(sizes: list[np.ndarray], start: Values) -> tuple[Program, list[np.ndarray]]:
         """Return the programme and the weights of a pass, which starts from the solution of the pass before."""
         weights = used.only(_weights(r, kind, width) for r in sizes)
-        compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics,
+        compressed = replace(compress(data, structure, weights=weights), unweighted=problem.statistics,
                              between=problem.between)
         return as_program(replace(pose(compressed), scale=scale), step=True).beginning(start), weights
 
     while True:
         if used.count:
-            problem = compress(data, weights=used.only(np.ones(e.n_samples) for e in data.experiments), **structure)
+            problem = compress(data, structure, weights=used.only(np.ones(e.n_samples) for e in data.experiments))
             base = as_program(pose(problem), step=True)
             scale = base.scale
         program, weights, spread, width = base, [], 0.0, 0.0

@@ -4,7 +4,7 @@ n sinusoids determine 2 n numbers of a linear response. One move from rest deter
 time, four numbers; what a record holds beyond that is noise.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.identify.design.rules import LONGEST, Check, many_lines, remaining_shares
-from optid.identify.informativity.signals import RecordSignals
+from optid.identify.informativity.signals import RecordSignals, beginning, hold_last
 from optid.phrases import plural
 
 ONE_MOVE = 4  # numbers that one move determines
@@ -62,17 +62,17 @@ class InputExcitation:
         return ""
 
 
-def excitation(signals: RecordSignals, c: int, name: str) -> InputExcitation:
-    """Describe how input c moves."""
-    records = signals.inputs(c)
+def excitation(records: Sequence[Array], name: str) -> InputExcitation:
+    """Describe how an input (T,) per experiment moves."""
     moves = sum(int(np.count_nonzero(np.diff(u))) for u in records)
-    x = max(records, key=len)[:LONGEST]
-    return InputExcitation(name, moves, 2 * moves < signals.samples, _lines(x),
-                      moves > 1 and all(map(_even, records)))
+    moving = [(u - u.mean()) / np.ptp(u) for u in records if np.ptp(u) > 0]  # in any unit, at any level
+    lines = _lines(max(moving, key=len)[:LONGEST]) if moving else None
+    ramp = moves > 1 and len(moving) == len(records) and all(map(_even, moving))
+    return InputExcitation(name, moves, 2 * moves < sum(map(len, records)), lines, ramp)
 
 
 def _lines(x: Array) -> int | None:
-    if x.size < 8 * MOST_LINES or np.ptp(x) == 0 or many_lines(x, MOST_LINES, LINES):
+    if x.size < 8 * MOST_LINES or many_lines(x, MOST_LINES, LINES):
         return None
     shares = remaining_shares(x[:, None], MOST_LINES, LINES)
     periods_seen = np.mean(np.diff(np.sign(x - x.mean())) != 0) * x.size >= 4
@@ -80,10 +80,10 @@ def _lines(x: Array) -> int | None:
 
 
 def _even(x: Array) -> bool:
-    """Whether samples (T,) follow a straight line."""
+    """Whether samples (T,) about their mean follow a straight line."""
     k = np.arange(len(x)) - (len(x) - 1) / 2
-    rest = x - x.mean() - k * (k @ x) / max(float(k @ k), 1.0)
-    return len(x) > 2 and bool(rest @ rest <= 1e-8 * float((x - x.mean()) @ (x - x.mean()))) and bool(np.ptp(x) > 0)
+    rest = x - k * (k @ x) / max(float(k @ k), 1.0)
+    return len(x) > 2 and bool(rest @ rest <= 1e-8 * float(x @ x))
 
 
 def check_numbers(data: Data, arguments: Mapping[str, Any]) -> Check | None:
@@ -101,8 +101,8 @@ def check_numbers(data: Data, arguments: Mapping[str, Any]) -> Check | None:
         asked, words = nx * (1 + len(inputs)), f"nx {nx}"
     else:
         return None
-    signals = RecordSignals.of(data)
-    found = [excitation(signals, c, name) for c, name in enumerate(inputs)]
+    u = [hold_last(e.u) for e in beginning(data)]
+    found = [excitation([samples[:, c] for samples in u], name) for c, name in enumerate(inputs)]
     numbers = [one.numbers for one in found]
     if None in numbers or (most := sum(n for n in numbers if n)) >= asked or not most:
         return Check("numbers", np.inf, "fine", "the inputs determine more numbers than the model has")

@@ -107,7 +107,7 @@ def _examined(data: Data) -> Informativity:
     signals = RecordSignals.of(data)
     if not signals.y or any(np.ptp(np.concatenate(signals.outputs(o))) == 0 for o in range(l)):
         return _untested(data, "an output does not move")
-    moves = [excitation(signals, c, name) for c, name in enumerate(data.inputs)]
+    moves = [excitation(signals.inputs(c), name) for c, name in enumerate(data.inputs)]
     if not data.is_regular:
         return replace(_untested(data, IRREGULAR), excitations=tuple(moves))
     copy = next(copies(signals, data.inputs, data.outputs), None)

@@ -12,13 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
-from optid.data.record import Data
+from optid.data.record import Data, Experiment
 from optid.data.stretches import interpolate_missing
 from optid.models.recursions import lfilter
 
 SAMPLES, EXPERIMENTS = 30_000, 40  # that are read, from the beginning of a record
 DISTINCT = 1e-6  # share of its length that a decay must keep beside the level to count
 Poles = NDArray[np.complex128]
+
+
+def beginning(data: Data) -> list[Experiment]:
+    """Return the experiments that are read of a record, in its raw units."""
+    data = data.raw()
+    if data.n_samples > 1.1 * SAMPLES:
+        data = data.split(SAMPLES / data.n_samples)[0]
+    return [e for e in data.experiments if e.n_samples > 1][:EXPERIMENTS]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +51,7 @@ class RecordSignals:
     @classmethod
     def of(cls, data: Data) -> "RecordSignals":
         """Read the beginning of a record."""
-        data = data.raw()
-        if data.n_samples > 1.1 * SAMPLES:
-            data = data.split(SAMPLES / data.n_samples)[0]
-        experiments = [e for e in data.experiments if e.n_samples > 1][:EXPERIMENTS]
+        experiments = beginning(data)
         u = [hold_last(e.u) for e in experiments]
         y = [interpolate_missing(e.y) for e in experiments]
         scales = []

@@ -316,17 +316,21 @@ def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index
         eta = [basis.values(job.u[samples, c]) for c, basis in enumerate(unknowns.expansion.inputs)]
         f = np.column_stack([part @ mu for part, mu in zip(eta, point.mus)])
         stretch, block = simulation.stretch_of(job, samples, f), np.empty((len(f), l, turn.shape[1] + 1))
-        states, outputs = simulation.march(job, first, stretch, state)
-        run = simulation.signals(job, stretch, states, outputs)
-        values = _values(unknowns, point, stretch, states, outputs, run.slopes, job.u[samples], f, eta)
-        sensitivities(parts, direct, run._replace(values=values), turn, block)
-        block[:, :, -1] = outputs - job.y[samples]
+        run = simulation.march(job, first, stretch, state)
+        about = simulation.signals(job, stretch, *run)
+        values = _values(unknowns, point, stretch, run, about.slopes, job.u[samples], [f, *eta])
+        sensitivities(parts, direct, about._replace(values=values), turn, block)
+        block[:, :, -1] = run[1] - job.y[samples]
         yield block
 
 
-def _values(unknowns: StateUnknowns, point: StatePoint, stretch: Stretch, states: Array, outputs: Array,
-            slopes: Array, u: Array, f: Array, eta: Sequence[Array]) -> Array:
-    """Return the signals of a run (T, s) that multiply unknowns, in the order of `StateUnknowns.signals`."""
+def _values(unknowns: StateUnknowns, point: StatePoint, stretch: Stretch, run: tuple[Array, Array], slopes: Array,
+            u: Array, driven: Sequence[Array]) -> Array:
+    """Return the signals of a run (T, s) that multiply unknowns, in the order of `StateUnknowns.signals`.
+
+    The run has states and outputs; ``driven`` are f of the inputs u (T, m), and the functions of every input.
+    """
+    (states, outputs), (f, *eta) = run, driven
     missing, one, states = np.isnan(stretch.y), np.ones((len(u), 1)), states[:, : unknowns.n]
     fed, argument = np.where(missing, outputs, stretch.y), np.hstack([states, u, one])
     zeta = [family.values(fed) for family in unknowns.expansion.feedback]

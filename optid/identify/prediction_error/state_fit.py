@@ -1,7 +1,7 @@
 """A fit of a state-space model: subspace fits to start from, the search for the best optimum, and its confirmation."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -34,25 +34,42 @@ WORDS = {"criterion": tuple(SIMULATORS), "stability": ("stable", "free"),
          "weighting": ("auto", "scale", "variance", "determinant")}
 
 
-def fit_states(name: str, data: Data, nx: int | str, *, pose: Pose, subspace: SubspaceSteps,
-               criterion: str, stability: str, weighting: str, iterations: int, constraints: Sequence[Any],
-               initial: Any, block_rows: Any, basis: Any = "linear", feedback_basis: Any = None, offset: Any = True,
-               feedthrough: Any = True, extend: Callable[..., Any] | None = None,
-               finish: Callable[..., Procedure] | None = None) -> Procedure:
+@dataclass(frozen=True)
+class StateSettings:
+    """Arguments of a fit as those of `formulations.state_space.hammerstein_ss`."""
+
+    nx: int | str
+    criterion: str
+    stability: str
+    weighting: str
+    iterations: int
+    constraints: Sequence[Any]
+    initial: HammersteinSS | Sequence[HammersteinSS]
+    block_rows: int | Sequence[int] | None
+    basis: Any = "linear"
+    feedback_basis: Any = None
+    offset: bool | str = True
+    feedthrough: bool | Sequence[bool] = True
+
+
+def fit_states(name: str, data: Data, *, pose: Pose, subspace: SubspaceSteps, extend: Callable[..., Any] | None = None,
+               finish: Callable[..., Procedure] | None = None, **words: Any) -> Procedure:
     """Fit a state-space model in the units of the samples, and return it in those of the record.
 
     ``pose`` states the problem of a fit, ``subspace`` those of a subspace fit to start from.
     ``extend`` makes (errors, optimum, figures) of a model with more functions from (errors, optimum, initial models
     with these functions), None for none.
     ``finish`` is a procedure of (plan, errors, constraints, optimum, figures) that returns the evidence; None
-    solves the programmes in the tangent.
-    The other arguments are those of `formulations.state_space.hammerstein_ss`, as are the errors raised.
+    solves the programmes in the tangent. The words are those of `StateSettings`; errors are raised as by
+    `formulations.state_space.hammerstein_ss`.
     """
-    for what, word in {"criterion": criterion, "stability": stability, "weighting": weighting}.items():
-        one_of(what, word, WORDS[what])
-    check_integer(iterations, "iterations", 1 if finish is None else 0)
+    settings = StateSettings(**words)
+    criterion, constraints, feedback_basis = settings.criterion, settings.constraints, settings.feedback_basis
+    for what, words in WORDS.items():
+        one_of(what, getattr(settings, what), words)
+    check_integer(settings.iterations, "iterations", 1 if finish is None else 0)
     record = in_memory(data, f"{criterion} errors")
-    constants = check_offset(offset, record)
+    constants = check_offset(settings.offset, record)
     if constants == "each":
         if feedback_basis is not None or extend is not None or finish is not None:
             raise StructureError(f"{name} with feedback, latent functions or states as variables has one constant for "
@@ -67,10 +84,10 @@ def fit_states(name: str, data: Data, nx: int | str, *, pose: Pose, subspace: Su
         if getattr(rule, "verify", None) is None:
             raise StructureError(f"constraint {rule.name!r} cannot judge a model, which the steps of this fit need; "
                                  "use it with hammerstein_ss.asivid")
-    plan = make_plan(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis,
-                   offset=bool(constants), instruments=instruments, feedthrough=feedthrough, stability="free",
-                   iterations=2 * (feedback_basis is not None), constraints=poles)
-    models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
+    plan = make_plan(name, data, nx=settings.nx, block_rows=None, basis=settings.basis, feedback_basis=feedback_basis,
+                     offset=bool(constants), instruments=instruments, feedthrough=settings.feedthrough,
+                     stability="free", iterations=2 * (feedback_basis is not None), constraints=poles)
+    models = [settings.initial] if isinstance(settings.initial, HammersteinSS) else list(settings.initial)
     models = [model.with_transform(inverse(plan.units)) for model in models]
     known = [model for model in models if model.latent]  # with functions that `extend` adds to the others
     found = {f"start {i}": model for i, model in enumerate(models, start=1) if not model.latent}
@@ -78,13 +95,15 @@ def fit_states(name: str, data: Data, nx: int | str, *, pose: Pose, subspace: Su
     def run() -> Procedure:
         # what functions of latent signals are added to needs no more than a first part of a long record
         first = plan if extend is None else replace(plan, data=first_samples(plan.data, STAGES[0]))
-        given = _block_rows(first) if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
-        nx = yield from _subspace_starts(subspace, first, given, block_rows is None, found, criterion == "prediction")
+        rows = settings.block_rows
+        given = _block_rows(first) if rows is None else [int(one) for one in np.atleast_1d(rows)]
+        nx = yield from _subspace_starts(subspace, first, given, rows is None, found, criterion == "prediction")
         if isinstance(nx, Evidence):
             return nx
-        errors, starts = errors_and_starts(first, nx, found, criterion, stability, tuple(rule.verify for rule in poles),
-                                  in_units(record, plan.units) if constants == "each" else None)
-        errors, best, figures = search_states(errors, starts, weighting, int(iterations))
+        errors, starts = errors_and_starts(
+            first, nx, found, criterion, settings.stability, tuple(rule.verify for rule in poles),
+            in_units(record, plan.units) if constants == "each" else None)
+        errors, best, figures = search_states(errors, starts, settings.weighting, int(settings.iterations))
         if extend is not None:
             errors, best = on_whole(errors, best, with_whole_inputs(plan.data, 2 * nx + 1))
             errors, best, more = extend(errors, best, known)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -172,14 +172,25 @@ class TransferErrors(TransferPredictor, Criterion):
         return every - (later @ a)[:, None] @ self.shifts.T
 
 
-def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None, gauge: str | None,
-                    offset: Offset) -> TransferErrors:
+class TransferOrders(NamedTuple):
+    """Orders of A, of every B with its delay, and of C and D, as in `formulations.prediction_error.hammerstein_bj`."""
+
+    na: Any
+    nb: Any
+    nk: Any
+    nc: Any = 0
+    nd: int | None = 0  # None where D is A
+
+
+def transfer_errors(data: Data, orders: TransferOrders, basis: Any, gauge: str | None, offset: Offset
+                    ) -> TransferErrors:
     """Check the arguments of a fit, and return its criterion on the record in its own units (`optid.program.units`).
 
     Unless D is A the initial states are unknown, and a record with missing inputs is cut into experiments. Arguments
-    and errors as in `formulations.prediction_error.hammerstein_bj`; ``nd`` is None where D is A and ``gauge`` for a
-    linear model. Without ``offset`` nothing is centred.
+    and errors as in `formulations.prediction_error.hammerstein_bj`; ``gauge`` is None for a linear model. Without
+    ``offset`` nothing is centred.
     """
+    na, nb, nk, nc, nd = orders
     data = one_output(data, "simulation errors" if (nc, nd) == (0, 0) else "prediction errors")
     constants, shifts = check_offset(offset, data), None
     layout = Layout(check_integer(na, "na (the number of poles)", 0), per_channel("nb", nb, data.inputs, low=1),

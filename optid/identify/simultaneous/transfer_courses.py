@@ -22,7 +22,7 @@ from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import check_offset
 from optid.identify.prediction_error.search import arx_start, iterate_passes
-from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
+from optid.identify.prediction_error.transfer_errors import TransferErrors, TransferOrders, transfer_errors
 from optid.identify.simultaneous.courses import Courses, Expressions, Formula, Reading, check_size
 from optid.program.sizes import GAUGE
 
@@ -43,7 +43,7 @@ class TransferCourses(Courses):
         if check_offset(offset, data) == "each":
             raise StructureError("this programme has one constant for all experiments; 'hammerstein_oe.exact' takes "
                                  "offset='each'")
-        errors = transfer_errors(data, *orders, basis, 0, 0, gauge, offset)
+        errors = transfer_errors(data, TransferOrders(*orders), basis, gauge, offset)
         check_size(errors.data.n_samples, LIMIT, "'hammerstein_oe.exact', which has the same optima, or fewer samples")
         return cls(errors)
 

@@ -92,6 +92,8 @@ def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block
     if solution.proof:
         said += "; for this (A, C) the coefficients are proved optimal"
     form = step.form
+    if form.injected or form.extra:  # an observer gain corrects the state, or instruments stand for the feedback
+        return Bound.none(f"{said}; its objective is no simulation error, which the Hankel bound is about")
     bound = simulation_bound(plan.records, form.expansion, form.n, form.weights, solution.objective / unit, block_rows,
-                             said, not form.injected and not form.extra)
+                             said)
     return replace(bound, value=unit * bound.value)
