@@ -16,6 +16,7 @@ from montecarlo import mapped
 
 import optid
 from formulations.constraints import shape
+from optid.core.statement import statement_of
 from optid.structures.bilinear import best_of
 
 
@@ -46,8 +47,8 @@ def excess_of_collinear(seed: int) -> tuple[float, str]:
         data, orders = collinear(seed), {"na": 2, "nb": 3, "basis": optid.Triangular(5)}
         fit = optid.fit(data, **orders)
         other = optid.fit(data, prove=False, solver="ipopt", raises=False, **orders)
-    core = fit.program.compressed.problem.core
-    tries = [fit.program.unit * best_of(core, 24, seed=7, iterations=2000).value, other.solution.objective]
+    core = fit.problem.compressed.problem.core
+    tries = [fit.problem.unit * best_of(core, 24, seed=7, iterations=2000).value, other.solution.objective]
     best = min([fit.solution.objective, *(value for value in tries if np.isfinite(value))])
     return fit.solution.objective / best - 1, str(fit.solution.status)
 
@@ -60,10 +61,11 @@ def excess_of_signed(seed: int) -> tuple[float, str]:
         warnings.simplefilter("ignore")
         fit = optid.fit(signed(seed), na=2, nb=2, basis=optid.Triangular(6, interval=(-1.0, 1.0)), constraints=rules)
         b = cp.Parameter(2, value=np.array([1.0, 0.0]))  # what is left of the problem for a given b is convex
-        swap = {id(fit.program.variables["b"]): b}
-        left = [member.tree_copy(swap) for name, group in fit.program.constraints.items() if name != "gauge"
+        stated = statement_of(fit.problem)
+        swap = {id(stated.variables["b"]): b}
+        left = [member.tree_copy(swap) for name, group in stated.constraints.items() if name != "gauge"
                 for member in group]
-        half = cp.Problem(fit.program.objective.tree_copy(swap), left)
+        half = cp.Problem(stated.objective.tree_copy(swap), left)
         values = []
         for angle in np.linspace(0, 2 * np.pi, 145)[:-1]:
             b.value = np.array([np.cos(angle), np.sin(angle)])
@@ -72,7 +74,7 @@ def excess_of_signed(seed: int) -> tuple[float, str]:
             except cp.SolverError:
                 continue
             if half.status == cp.OPTIMAL:
-                values.append(fit.program.unit * float(half.value))
+                values.append(fit.problem.unit * float(half.value))
     return fit.solution.objective / min(values) - 1, str(fit.solution.status)
 
 

@@ -97,7 +97,7 @@ def main(argv=None) -> dict:
           f"prove {1e3 * t.prove:.1f} ms")
     figures["exact_ms"] = 1e3 * seconds
     if not options.skip_raw:
-        raw, objective = casadi_raw(data, 2, 10, structure["basis"], fit.program.start)
+        raw, objective = casadi_raw(data, 2, 10, structure["basis"], fit.problem.start)
         same = abs(objective - fit.solution.objective) / objective
         print(f"  raw samples in CasADi + IPOPT: {raw:.1f} s, {raw / seconds:.0f} times as long; "
               f"objectives agree to {same:.0e} (relative)")

@@ -29,7 +29,7 @@ import numpy as np
 import optid
 from formulations.nuclear_subspace import low_rank
 from optid.backends import Settings, find
-from optid.core.program import as_program
+from optid.core.statement import for_solvers
 from optid.identify.subspace.low_rank import held_out_fit, order_scores, structure
 from optid.identify.subspace.plan import Plan
 from optid.solving.solve import solve
@@ -78,10 +78,10 @@ def nuclear_scores(train: optid.Data, test: optid.Data, form: str, rows: int, we
 
 def race(structured, weight: float, solvers: list[str], accuracy: float, repeats: int) -> None:
     """Solve one programme by the ADMM and as an SDP."""
-    program = as_program(low_rank(structured, structured.penalty(weight)))
+    program = for_solvers(low_rank(structured, structured.penalty(weight)))
     times = []
     for _ in range(repeats):
-        fresh = as_program(low_rank(structured, structured.penalty(weight)))
+        fresh = for_solvers(low_rank(structured, structured.penalty(weight)))
         # the Gram matrix is decomposed anew: it belongs to the time of one solve
         for name in ("gram", "groups", "index", "known", "data"):
             fresh.structure.problem.__dict__.pop(name, None)
@@ -96,7 +96,7 @@ def race(structured, weight: float, solvers: list[str], accuracy: float, repeats
     print(f"    {'admm':10s} {min(times):9.4f} s  objective {own.objective:.8g}  bound {own.bound.value:.8g}  "
           f"{answer.iterations} iterations, {own.status}")
     for solver in solvers:
-        fresh = as_program(low_rank(structured, structured.penalty(weight)))
+        fresh = for_solvers(low_rank(structured, structured.penalty(weight)))
         clock = time.process_time()
         fresh.problem.get_problem_data(solver.upper())
         compiled = time.process_time() - clock

@@ -88,7 +88,7 @@ def two_tanks(samples: int = 1000) -> tuple[StateErrors, np.ndarray]:
     u = slow_input(rng, samples)
     y = tanks(rng)(u)
     record = optid.Data(u, y + 0.01 * y.std() * rng.normal(size=y.shape))
-    compressed = optid.fit(record, "lfr.exact", nx=2, channels=2).program.compressed
+    compressed = optid.fit(record, "lfr.exact", nx=2, channels=2).problem.compressed
     return compressed.criterion, compressed.reference * (1 + 0.01 * rng.normal(size=compressed.reference.size))
 
 

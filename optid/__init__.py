@@ -17,7 +17,7 @@ _HOME = {
     "data.channels": ["Transform"],
     "bases": ["Triangular", "Trigonometric", "Polynomial", "BSpline", "PiecewiseConstant", "Linear", "UserFunctions"],
     "models": ["Nonlinearity", "HammersteinSS", "NoiseCovariances", "HammersteinTF"],
-    "core.program": ["Program"],
+    "core.problem": ["Problem"],
     "program.solution": ["Status", "Solution", "Bound"],
     "solving.solve": ["solve"],
     "identify.fitting": ["fit", "resolve", "Fit"],
@@ -37,7 +37,7 @@ _MODULES = {name: name for name in ("signals", "bases", "errors", "examples", "p
     "plots": "show.plots", "report": "show.report", "identify": "identify", "noise": "identify.noise",
     "tracking": "identify.tracking"}
 
-_POSED = {name for home in ("core.program", "solving.solve", "identify.fitting", "identify.selection")
+_POSED = {name for home in ("core.problem", "solving.solve", "identify.fitting", "identify.selection")
           for name in _HOME[home]}
 
 _load, __dir__ = on_first_use(__name__, _HOME, _MODULES)

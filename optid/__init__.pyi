@@ -27,7 +27,7 @@ from optid.models import Nonlinearity as Nonlinearity
 from optid.models import HammersteinSS as HammersteinSS
 from optid.models import NoiseCovariances as NoiseCovariances
 from optid.models import HammersteinTF as HammersteinTF
-from optid.core.program import Program as Program
+from optid.core.problem import Problem as Problem
 from optid.program.solution import Status as Status
 from optid.program.solution import Solution as Solution
 from optid.program.solution import Bound as Bound

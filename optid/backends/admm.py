@@ -10,7 +10,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.backends.back_end import Answer, Minimum, Settings
 from optid.core.low_rank import LowRankForm
-from optid.core.program import Program
+from optid.core.problem import Problem
 from optid.program.solution import tolerance
 from optid.structures.nuclear_norm import NuclearProblem
 
@@ -21,12 +21,12 @@ FACTOR = 1.3  # by how much
 FIRST = 60, 3.0  # iterations in which the size of the step is found, and the factor there
 
 
-def run(program: Program, settings: Settings) -> Answer:
+def run(problem: Problem, settings: Settings) -> Answer:
     """Solve a programme of the form `LowRankForm` without further constraints.
 
     Options: ``limit`` (iterations at most, default 20,000).
     """
-    form = LowRankForm.of(program.core)
+    form = LowRankForm.of(problem)
     assert form is not None
     allowed = 0.5 * tolerance(settings.accuracy)  # half of what the judgement allows
     found = minimise(form.problem, form.weight, allowed, int(dict(settings.options).get("limit", 20_000)))

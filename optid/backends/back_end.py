@@ -1,4 +1,4 @@
-"""What a back end is: one function ``run(program, settings) -> Answer`` with its capabilities as data.
+"""What a back end is: one function ``run(problem, settings) -> Answer`` with its capabilities as data.
 
 What it answers is a claim: `optid.solving` measures the point and decides the status.
 """
@@ -14,8 +14,8 @@ from optid.core.form import Form
 from optid.errors import StructureError
 from optid.program.solution import Status
 
-if TYPE_CHECKING:  # programmes import CVXPY, which the list of solvers does not need
-    from optid.core.program import Program
+if TYPE_CHECKING:  # problems import CVXPY, which the list of solvers does not need
+    from optid.core.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class BackEnd:
 
     name: str  # the word, in lower case
     classes: frozenset[str]  # programme classes it accepts: "LP", "QP", "SOCP", "SDP", "conic", "NLP"
-    run: Callable[["Program", Settings], Answer] = field(repr=False)  # (program, settings) -> Answer
+    run: Callable[["Problem", Settings], Answer] = field(repr=False)  # (problem, settings) -> Answer
     installed: bool = True  # whether it can run here
     pip: str = ""  # what to install where it cannot
     form: str = ""  # word of the form of problems that it exploits, whatever their class
@@ -93,28 +93,30 @@ class BackEnd:
         """Classes and form it accepts, as words."""
         return (*sorted(self.classes), *([self.form] if self.form else []))
 
-    def form_of(self, program: "Program") -> Form | None:
+    def form_of(self, problem: "Problem") -> Form | None:
         """Return the form of the problem that it exploits, None where it has another."""
-        return None if self.takes is None else self.takes(program.core)
+        return None if self.takes is None else self.takes(problem)
 
-    def exploits(self, program: "Program") -> bool:
+    def exploits(self, problem: "Problem") -> bool:
         """Whether it accepts the form of the problem, with the user's constraints."""
-        form = self.form_of(program)
-        return form is not None and (form.constrained or not program.user_constraints)
+        form = self.form_of(problem)
+        return form is not None and (form.constrained or not problem.constraint_names)
 
-    def refuses(self, program: "Program") -> str:
+    def refuses(self, problem: "Problem") -> str:
         """Return why this back end cannot take the programme, or an empty string."""
-        if self.exploits(program):
+        if self.exploits(problem):
             return ""
-        if self.form_of(program) is not None:
-            names = ", ".join(map(repr, program.user_constraints))
-            return (f"{self.name} takes no further constraints ({names}); use a back end of class {program.kind} "
+        from optid.core.statement import class_of, statement_of
+
+        if self.form_of(problem) is not None:
+            names = ", ".join(map(repr, problem.constraint_names))
+            return (f"{self.name} takes no further constraints ({names}); use a back end of class {class_of(problem)} "
                     "(clarabel, scs)")
-        kind = program.kind
+        kind = class_of(problem)
         if kind in self.classes:
             return ""
         if kind == "NLP":
-            parts = ", ".join(program.nonconvex_parts())
-            return (f"{self.name} solves {', '.join(self.accepted)}; {program.name!r} is not convex in {parts}. "
+            parts = ", ".join(statement_of(problem).nonconvex_parts())
+            return (f"{self.name} solves {', '.join(self.accepted)}; {problem.name!r} is not convex in {parts}. "
                     "Use an NLP back end (gauss_newton, ipopt, uno) or a relaxed formulation")
-        return f"{self.name} solves {', '.join(self.accepted)}; {program.name!r} is of class {kind}"
+        return f"{self.name} solves {', '.join(self.accepted)}; {problem.name!r} is of class {kind}"

@@ -10,7 +10,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.backends.back_end import Answer, Minimum, Settings
 from optid.core.group_sparse import GroupSparseForm
-from optid.core.program import Program
+from optid.core.problem import Problem
 from optid.kernel_cache import cached_njit
 from optid.program.solution import Status, tolerance
 from optid.structures.group_sparse import GroupProblem
@@ -20,16 +20,16 @@ SWEEPS = 25  # sweeps of block descent between Newton steps
 STALLED = 30  # rounds without a better gap or value after which nothing more is to be gained in floating point
 
 
-def run(program: Program, settings: Settings) -> Answer:
+def run(problem: Problem, settings: Settings) -> Answer:
     """Solve a programme of the form `GroupSparseForm` without further constraints.
 
     Options: ``limit`` (rounds at most, default 2,000).
     """
-    form = GroupSparseForm.of(program.core)
+    form = GroupSparseForm.of(problem)
     assert form is not None
     if not form.penalty > 0:
         return Answer(Status.FAILED, f"the penalty is {form.penalty}; this method needs a positive one")
-    start = form.flat(program.start) if settings.warm and program.start else None
+    start = form.flat(problem.start) if settings.warm and problem.start else None
     limit = int(dict(settings.options).get("limit", 2000))
     found = minimise(form.problem, form.penalty, settings.accuracy, limit, start)
     return found.answer(tolerance(settings.accuracy), form.unpack(found.point), form.duals(found.dual))

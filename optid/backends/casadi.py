@@ -21,7 +21,8 @@ import scipy.sparse as sp
 
 from optid.backends.back_end import Answer, Settings
 from optid.backends.dnlp import Smooth, get_or_make, smooth
-from optid.core.program import Program
+from optid.core.problem import Problem
+from optid.core.statement import statement_of
 from optid.errors import StructureError
 from optid.program.expressions import MOVES, sources
 from optid.program.solution import Status
@@ -223,23 +224,24 @@ def options(name: str, settings: Settings) -> dict[str, Any]:
     return chosen
 
 
-def solve_with(name: str, program: Program, settings: Settings) -> Answer:
+def solve_with(name: str, problem: Problem, settings: Settings) -> Answer:
     """Solve an LP, QP or smooth nonconvex programme with "ipopt" or "fatrop".
 
     The translated programme and the compiled solver are kept with the CVXPY problem: only parameter values and the
     start are new in the next solve. Multipliers are in CVXPY's convention ``L = f + dual (lhs - rhs)``.
     """
     clock = time.perf_counter()
-    form = smooth(program.problem)
+    posed = statement_of(problem).problem
+    form = smooth(posed)
     chosen = options(name, settings)
-    if name == "ipopt" and 0 < program.scale < 1:  # its tolerances are absolute: outputs of 1e-3 would all be met
-        chosen = {"ipopt.obj_scaling_factor": 1.0 / program.scale} | chosen
-    if name == "ipopt" and program.settled and settings.warm:  # a large barrier would throw away the start
+    if name == "ipopt" and 0 < problem.scale < 1:  # its tolerances are absolute: outputs of 1e-3 would all be met
+        chosen = {"ipopt.obj_scaling_factor": 1.0 / problem.scale} | chosen
+    if name == "ipopt" and problem.settled and settings.warm:  # a large barrier would throw away the start
         chosen = {"ipopt.mu_init": 1e-6} | chosen
-    if name == "ipopt" and program.courses and not program.settled and chosen["ipopt.max_iter"] == LIMIT:
+    if name == "ipopt" and problem.courses and not problem.settled and chosen["ipopt.max_iter"] == LIMIT:
         chosen["ipopt.max_iter"] = FAR
-    graph = get_or_make(program.problem, "casadi", lambda: translate(form))
-    solver = get_or_make(program.problem, (name, repr(sorted(chosen.items()))),
+    graph = get_or_make(posed, "casadi", lambda: translate(form))
+    solver = get_or_make(posed, (name, repr(sorted(chosen.items()))),
                   lambda: ca.nlpsol("solver", name, graph, chosen))
     compiling = time.perf_counter() - clock
     lower, upper = form.bounds
@@ -247,7 +249,7 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
     found = solver(x0=form.start(), p=form.parameter_values(), lbx=lower, ubx=upper, lbg=row_lower, ubg=row_upper)
     statistics = solver.stats()
     word, status = _status(statistics)
-    return form.answer(program, status, word, np.asarray(found["x"]), np.asarray(found["lam_g"]),
+    return form.answer(problem, status, word, np.asarray(found["x"]), np.asarray(found["lam_g"]),
                        iterations=int(statistics.get("iter_count", -1)), compile=compiling)
 
 

@@ -13,7 +13,7 @@ from optid.errors import LookupFailed, SolverMissing, StructureError, nearest
 from optid.program.solution import Status
 
 if TYPE_CHECKING:
-    from optid.core.program import Program
+    from optid.core.problem import Problem
 
 GROUP = "optid.backends"
 
@@ -34,7 +34,7 @@ def back_ends() -> dict[str, BackEnd]:
     return found
 
 
-def _absent(program: "Program", settings: Settings) -> Answer:
+def _absent(problem: "Problem", settings: Settings) -> Answer:
     return Answer(Status.FAILED, "cannot be loaded")
 
 
@@ -64,21 +64,23 @@ AUTO: dict[str, tuple[str, ...]] = {
 """What `choose` chooses from: the first installed back end of a structure or class of programme."""
 
 
-def choose(program: "Program") -> tuple[BackEnd, str]:
+def choose(problem: "Problem") -> tuple[BackEnd, str]:
     """Choose a back end by class and size of the programme, and say why.
 
     Raises:
         StructureError: when no installed back end accepts the programme.
     """
     for back_end in sorted(back_ends().values(), key=lambda one: one.name not in AUTO.get(one.form, ())):
-        form = back_end.form_of(program) if back_end.installed else None
-        if form is not None and back_end.exploits(program):
+        form = back_end.form_of(problem) if back_end.installed else None
+        if form is not None and back_end.exploits(problem):
             return back_end, f"{back_end.name}: {form.about}"
-    kind = program.kind
-    for name in AUTO["convex" if kind != "NLP" else "small NLP" if program.size <= 200 else "NLP"]:
+    from optid.core.statement import class_of, count_variables
+
+    kind, size = class_of(problem), count_variables(problem)
+    for name in AUTO["convex" if kind != "NLP" else "small NLP" if size <= 200 else "NLP"]:
         back_end = back_ends().get(name)
         if back_end is not None and back_end.installed and kind in back_end.classes:
-            return back_end, f"{name}: class {kind}, {program.size} unknowns"
+            return back_end, f"{name}: class {kind}, {size} unknowns"
     raise StructureError(f"no installed back end accepts a programme of class {kind}; see `optid solvers`")
 
 
@@ -86,10 +88,12 @@ FALLBACKS = ("daqp", "qoco", "highs", "cvxopt", "ipopt")
 """Convex back ends that take over from one chosen automatically, in this order; IPOPT comes with optid."""
 
 
-def fallbacks(program: "Program", failed: str) -> Iterator[BackEnd]:
+def fallbacks(problem: "Problem", failed: str) -> Iterator[BackEnd]:
     """Yield the installed back ends that can solve a programme in place of one that gave no usable answer."""
-    names = AUTO["NLP"] if program.kind == "NLP" else FALLBACKS if failed in AUTO["convex"] else ()
+    from optid.core.statement import class_of
+
+    names = AUTO["NLP"] if class_of(problem) == "NLP" else FALLBACKS if failed in AUTO["convex"] else ()
     for name in names:
         back_end = back_ends().get(name) if name != failed else None
-        if back_end is not None and back_end.installed and not back_end.refuses(program):
+        if back_end is not None and back_end.installed and not back_end.refuses(problem):
             yield back_end

@@ -17,7 +17,7 @@ from optid.backends.catalogue import WITHOUT_DUALS
 from optid.core.constraint import join_by_name
 from optid.core.leaves import Affine
 from optid.core.problem import Problem
-from optid.core.program import Program
+from optid.core.statement import statement_of
 from optid.core.terms import Squares
 from optid.program.expressions import solve_quietly
 from optid.program.solution import Status
@@ -84,31 +84,32 @@ def tolerances(name: str, settings: Settings) -> dict[str, Any]:
     return {**options, **settings.options}
 
 
-def solve_with(name: str, program: Program, settings: Settings) -> Answer:
+def solve_with(name: str, problem: Problem, settings: Settings) -> Answer:
     """Solve a convex programme with one of CVXPY's solvers, by its lower-case name.
 
     An exception inside the solver becomes ``Status.FAILED`` with its words.
     """
-    if name == "clarabel" and not settings.options and not settings.verbose and _has_rows_alone(program):
-        return _least_squares_in_rows(program.core, settings)
-    problem, options = program.problem, tolerances(name, settings)
-    if name == "clarabel" and program.scale < 1:  # objectives are in units of the data; its relative gap is one to 1
-        options |= {key: options[key] * max(program.scale, 1e-8) for key in ("tol_gap_abs", "tol_gap_rel")
+    if name == "clarabel" and not settings.options and not settings.verbose and _has_rows_alone(problem):
+        return _least_squares_in_rows(problem, settings)
+    statement, options = statement_of(problem), tolerances(name, settings)
+    posed = statement.problem
+    if name == "clarabel" and problem.scale < 1:  # objectives are in units of the data; its relative gap is one to 1
+        options |= {key: options[key] * max(problem.scale, 1e-8) for key in ("tol_gap_abs", "tol_gap_rel")
                     if key not in settings.options}
     try:
-        solve_quietly(problem, name.upper(), verbose=settings.verbose, warm_start=settings.warm, **options)
+        solve_quietly(posed, name.upper(), verbose=settings.verbose, warm_start=settings.warm, **options)
     except Exception as error:  # a solver that crashes is an outcome
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
-    status, statistics = STATUS.get(problem.status, Status.FAILED), problem.solver_stats
-    compiling = float("nan") if problem.compilation_time is None else float(problem.compilation_time)
+    status, statistics = STATUS.get(posed.status, Status.FAILED), posed.solver_stats
+    compiling = float("nan") if posed.compilation_time is None else float(posed.compilation_time)
     iterations = getattr(statistics, "num_iters", None)
-    answer = Answer(status, problem.status, iterations=-1 if iterations is None else int(iterations), compile=compiling)
-    if status is Status.INFEASIBLE and name in AMBIGUOUS and not _has_no_point(problem, name, options):
+    answer = Answer(status, posed.status, iterations=-1 if iterations is None else int(iterations), compile=compiling)
+    if status is Status.INFEASIBLE and name in AMBIGUOUS and not _has_no_point(posed, name, options):
         return Answer(Status.FAILED, "infeasible_or_unbounded", compile=compiling)
     if status not in (Status.OPTIMAL, Status.INACCURATE, Status.LIMIT) or any(
-            v.value is None for v in program.variables.values()):
+            v.value is None for v in statement.variables.values()):
         return answer
-    return replace(answer, values=program.values(), duals={} if name in WITHOUT_DUALS else program.duals())
+    return replace(answer, values=statement.values(), duals={} if name in WITHOUT_DUALS else statement.duals())
 
 
 def _has_no_point(problem: cp.Problem, name: str, options: dict[str, Any]) -> bool:
@@ -179,10 +180,9 @@ def _places(size: int) -> tuple[np.ndarray, np.ndarray, int]:
     return i, j, n
 
 
-def _has_rows_alone(program: Program) -> bool:
+def _has_rows_alone(problem: Problem) -> bool:
     """Whether a programme states one term of squares without products, under rows and matrices: it needs no CVXPY."""
-    problem: Problem | None = program.core
-    if problem is None or len(problem.terms) != 1 or not isinstance(problem.terms[0], Squares):
+    if len(problem.terms) != 1 or not isinstance(problem.terms[0], Squares):
         return False
     if not problem.start.keys() <= set(problem.terms[0].z):  # the record tells no size of an unknown without effect
         return False

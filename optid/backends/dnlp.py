@@ -22,7 +22,8 @@ from cvxpy.reductions.solution import Solution as ReducedSolution
 from cvxpy.reductions.solvers.nlp_solving_chain import _set_nlp_initial_point
 
 from optid.backends.back_end import Answer
-from optid.core.program import Program
+from optid.core.problem import Problem
+from optid.core.statement import statement_of
 from optid.errors import StructureError
 from optid.program.limits import EQUALITIES, rows_of
 from optid.program.solution import Status
@@ -79,7 +80,7 @@ class Smooth:
         self.attributes.update_parameters(self.original)
         return _flat([parameter.value for parameter in self.problem.parameters()])
 
-    def answer(self, program: Program, status: Status, word: str, x: Any, multipliers: Any, **figures: Any) -> Answer:
+    def answer(self, problem: Problem, status: Status, word: str, x: Any, multipliers: Any, **figures: Any) -> Answer:
         """Return a solver's claim about a programme, whose problem this is, with point and multipliers where usable.
 
         Status and word are the claim in our words and in the solver's; x (unknowns,) is a point of the smooth problem.
@@ -96,9 +97,10 @@ class Smooth:
         solution = ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})
         solution = self.attributes.invert(self.kinks.invert(solution, self.inverse[1]), self.inverse[0])
         values, duals = solution.primal_vars, solution.dual_vars
-        return Answer(status, word, {name: values[v.id] for name, v in program.variables.items() if v.id in values}, {
+        stated = statement_of(problem)
+        return Answer(status, word, {name: values[v.id] for name, v in stated.variables.items() if v.id in values}, {
             name: np.concatenate([np.ravel(duals[member.id], order="F") for member in group] or [np.zeros(0)])
-            for name, group in program.constraints.items() if all(member.id in duals for member in group)}, **figures)
+            for name, group in stated.constraints.items() if all(member.id in duals for member in group)}, **figures)
 
 
 def smooth(problem: cp.Problem) -> Smooth:

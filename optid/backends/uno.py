@@ -13,7 +13,8 @@ import numpy as np
 
 from optid.backends.back_end import Answer, Settings
 from optid.backends.dnlp import Derivatives, Smooth, smooth
-from optid.core.program import Program
+from optid.core.problem import Problem
+from optid.core.statement import statement_of
 from optid.program.solution import Status
 
 ENDED = {
@@ -28,14 +29,14 @@ POINT = {
 }
 
 
-def run(program: Program, settings: Settings) -> Answer:
+def run(problem: Problem, settings: Settings) -> Answer:
     """Solve an LP, QP or smooth nonconvex programme with Uno.
 
     Options: ``preset``, default "filtersqp", and Uno's own.
     """
     unopy: Any = import_module("unopy")
     clock = time.perf_counter()
-    form = smooth(program.problem)
+    form = smooth(statement_of(problem).problem)
     solver = unopy.UnoSolver()
     chosen = options(settings)
     solver.set_preset(chosen.pop("preset"))
@@ -45,7 +46,7 @@ def run(program: Program, settings: Settings) -> Answer:
     compiling = time.perf_counter() - clock
     result = solver.optimize(model)
     word, status = _status(str(result.optimization_status), str(result.solution_status))
-    return form.answer(program, status, word, list(result.primal_solution), list(result.constraint_dual_solution),
+    return form.answer(problem, status, word, list(result.primal_solution), list(result.constraint_dual_solution),
                        iterations=int(result.number_iterations), compile=compiling)
 
 

@@ -9,52 +9,50 @@ from optid.certificate.lifting import lift
 from optid.core.least_squares import RankOneForm
 from optid.core.leaves import Affine
 from optid.core.problem import Problem
-from optid.core.program import Program
 from optid.program.expressions import flat, flat_value, jacobians, solve_quietly
 from optid.program.limits import EQUALITIES
 
 
-def explain(program: Program) -> str:
+def explain(problem: Problem) -> str:
     """Return a sentence that lists a conflicting subset of the user's constraints.
 
     The subset is irreducible: without any one of its members the rest can be satisfied (deletion filter, Chinneck
     and Dravnieks 1991). Constraints that are not convex in the leaves take part through their linearisation at the
     start, and the sentence says so.
     """
-    conflict = conflicting_subset(program)
+    conflict = conflicting_subset(problem)
     if conflict is None:
-        names = ", ".join(program.core.constraint_names) or "none"
-        return (f"{program.name!r} was reported infeasible, but its constraints ({names}) can be "
+        names = ", ".join(problem.constraint_names) or "none"
+        return (f"{problem.name!r} was reported infeasible, but its constraints ({names}) can be "
                 "satisfied together; try another solver (optid solvers)")
     if len(conflict) == 1:
         text = f"constraint {conflict[0]!r} cannot be satisfied by any model of this structure; relax it or drop it"
     else:
         text = (f"constraints {' and '.join(repr(n) for n in conflict)} contradict each other; "
                 "relax or drop one of them (each subset without one of them can be satisfied)")
-    bent = {one.name for one in program.core.constraints() if not one.limit.member.is_dcp()}
+    bent = {one.name for one in problem.constraints() if not one.limit.member.is_dcp()}
     used = [name for name in conflict if name in bent]
     return text + (f" (judged on the linearisation of {', '.join(used)})" if used else "")
 
 
-def conflicting_subset(program: Program) -> list[str] | None:
+def conflicting_subset(problem: Problem) -> list[str] | None:
     """Return the names of an irreducible infeasible subset, or None where all can be satisfied together.
 
     What can be satisfied is judged on a convex outer approximation, so that a subset returned is a contradiction
     indeed: every leaf is free, constraints about ``mu bᵀ`` are read as those of a matrix.
     """
-    kept = list(program.core.constraint_names)
-    if satisfiable(program, kept):
+    kept = list(problem.constraint_names)
+    if satisfiable(problem, kept):
         return None
     for name in list(kept):
         trial = [other for other in kept if other != name]
-        if not satisfiable(program, trial):
+        if not satisfiable(problem, trial):
             kept = trial
     return kept
 
 
-def satisfiable(program: Program, names: Sequence[str]) -> bool:
+def satisfiable(problem: Problem, names: Sequence[str]) -> bool:
     """Whether the named constraints can hold together, as far as a convex outer approximation tells."""
-    problem: Problem = program.core
     form, space = RankOneForm.of(problem), problem.space
     if not problem.constraints():
         return True

@@ -13,11 +13,11 @@ from optid.certificate.ladder import certify
 from optid.certificate.shape_duals import LinearRows
 from optid.core.least_squares import LeastSquaresForm, RankOneForm
 from optid.core.problem import Problem
-from optid.core.program import MAX_SIZE
 from optid.core.terms import Squares, Values
 from optid.program.solution import Bound, relative_gap
 from optid.structures.rank_one import Point, RankOne
 
+MAX_SIZE = 700  # multipliers up to which the semidefinite relaxation is tried
 
 @dataclass
 class Lifted:

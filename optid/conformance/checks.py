@@ -19,7 +19,8 @@ import numpy as np
 
 from optid.backends.back_end import BackEnd
 from optid.conformance.zoo import SOLVED, Case, cases
-from optid.core.program import Program, as_program
+from optid.core.problem import Problem
+from optid.core.statement import for_solvers, statement_of
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError
 from optid.program.solution import Solution, Status
@@ -48,16 +49,16 @@ class Row:
 
 def accepted_cases(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list[Case]:
     """Return the cases whose class the back end says it solves."""
-    return [case for case in (cases() if zoo is None else zoo) if not back_end.refuses(as_program(case.build()))]
+    return [case for case in (cases() if zoo is None else zoo) if not back_end.refuses(for_solvers(case.build()))]
 
 
 def run_case(back_end: BackEnd, case: Case, **settings) -> Row:
     """Solve a case of the zoo, with settings of `optid.solve`, and compare the outcome with what is known."""
     clock = time.perf_counter()
-    program = as_program(case.build())
-    solution = solve(program, back_end, **settings)
+    problem = for_solvers(case.build())
+    solution = solve(problem, back_end, **settings)
     seconds = time.perf_counter() - clock
-    return Row(case, back_end.name, solution, seconds, tuple(_complaints(back_end, case, program, solution)))
+    return Row(case, back_end.name, solution, seconds, tuple(_complaints(back_end, case, problem, solution)))
 
 
 def check_back_end(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list[Row]:
@@ -153,7 +154,7 @@ def value_error(case: Case, solution: Solution) -> float:
     return abs(solution.objective - case.value) / max(abs(case.value), 1e-6 * solution.scale)
 
 
-def _complaints(back_end: BackEnd, case: Case, program: Program, solution: Solution):
+def _complaints(back_end: BackEnd, case: Case, problem: Problem, solution: Solution):
     claims = solution.status in SUCCESS
     if case.outcome != SOLVED:
         if claims:
@@ -174,7 +175,7 @@ def _complaints(back_end: BackEnd, case: Case, program: Program, solution: Solut
         yield from _differs(f"variable {name!r}", solution.values[name], np.asarray(known, dtype=float), POINT)
     if not back_end.duals:
         return
-    if missing := set(program.constraints) - set(solution.duals):
+    if missing := set(statement_of(problem).constraints) - set(solution.duals):
         yield f"no multipliers for {', '.join(sorted(missing))}"
         return
     for name, known in case.duals.items():

@@ -12,6 +12,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 import scipy.sparse as sp
+from cvxpy.lin_ops.lin_utils import ID_COUNTER, get_id
 
 from optid.arrays import Array
 from optid.core.terms import Values, flat
@@ -163,6 +164,13 @@ class LeafSpace:
 
     start: Values
     symmetric: frozenset[str] = frozenset()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_last_id": get_id()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        ID_COUNTER.count = max(ID_COUNTER.count, state.pop("_last_id"))  # CVXPY's next objects must have other ids
+        vars(self).update(state)
 
     @cached_property
     def places(self) -> dict[str, slice]:

@@ -49,6 +49,7 @@ class Problem:
         about: names of further expressions that depend on the values of the unknowns.
         weights: of penalties, which `under_weights` changes.
         posed: states the problem with given weights, as keywords.
+        step: whether a procedure goes on from the answer, so that no proof is asked for.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Problem:
     about: frozenset[str] = frozenset()
     weights: Mapping[str, float] = field(default_factory=dict)
     posed: Callable[..., "Problem"] | None = field(default=None, repr=False)
+    step: bool = False
 
     def under_weights(self, **weights: float) -> "Problem":
         """Return the problem with other weights of its penalties."""
@@ -80,8 +82,19 @@ class Problem:
         return replace(self.posed(**{**self.weights, **weights}), builders=self.builders)
 
     def beginning(self, start: Values, model: Callable[[Values], Any] | None = None) -> "Problem":
-        """Return the problem with another start, and another model of its values; constraints are as they were read."""
-        made = replace(self, start=start, model=model or self.model)
+        """Return the problem with another start, of some unknowns at least, and another model of its values.
+
+        Constraints are as they were read.
+        """
+        start = {name: start.get(name, value) for name, value in self.start.items()}
+        return self._as_read(start=start, model=model or self.model)
+
+    def with_terms(self, *terms: Term) -> "Problem":
+        """Return the problem with other terms of the same leaves; constraints are as they were read."""
+        return self._as_read(terms=terms)
+
+    def _as_read(self, **changes: Any) -> "Problem":
+        made = replace(self, **changes)
         vars(made).update({name: one for name, one in vars(self).items() if name in ("space", "_at_start")})
         return made
 
@@ -105,7 +118,7 @@ class Problem:
 
         step = replace(
             self, start=x, terms=(squares,), leaves=tuple(Affine.of(leaf, x) for leaf in self.leaves),
-            restrictions=((gauge,) if gauges else ()) + self.restrictions, compressed=compressed)
+            restrictions=((gauge,) if gauges else ()) + self.restrictions, compressed=compressed, step=True)
         vars(step)["space"] = self.space  # the same leaves of the same usual sizes, in which constraints are read
         held = [replace(one, moving=False, builder=one.builder + bool(gauges)) for one in self.constraints(x)]
         for one in held:
@@ -182,6 +195,16 @@ class Problem:
     def space(self) -> LeafSpace:
         """The leaves, the unknowns first."""
         return LeafSpace(self.leaf_values(self.start), self.symmetric)
+
+    @property
+    def no_proof(self) -> str:
+        """Why there can be no proof, where that is known beforehand."""
+        return self.proof if isinstance(self.proof, str) else ""
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the unknowns."""
+        return {name: np.shape(value) for name, value in self.start.items()}
 
     @cached_property
     def size(self) -> int:

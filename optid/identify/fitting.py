@@ -15,7 +15,6 @@ from optid.annotations import check_values
 from optid.bases import Linear, fitted_bases
 from optid.core.prices import Price, price_constraints
 from optid.core.problem import Problem
-from optid.core.program import Program
 from optid.data.record import Data, not_a_record
 from optid.data.streams import Stream
 from optid.errors import (
@@ -47,10 +46,10 @@ class Fit(Rendered):
     """A fitted model with its formulation, arguments, record and outcome.
 
     A pickled fit keeps its results, but not its programme, which is built and solved again where it is needed (by
-    `program`, `uncertainty` or `resolve`); its constraints must then be picklable.
+    `problem`, `uncertainty` or `resolve`); its constraints must then be picklable.
 
     Attributes:
-        outcome: of the formulation; see `program`, `solution`, `model`, `figures` and `steps`.
+        outcome: of the formulation; see `problem`, `solution`, `model`, `figures` and `steps`.
         prices: activity and price of every user constraint.
         findings: of the checks of the record, one sentence each.
         seconds: wall time of the whole call.
@@ -69,9 +68,9 @@ class Fit(Rendered):
     cross_validated: tuple[tuple[float, ...], float] | None = None
 
     @property
-    def program(self) -> Program:
+    def problem(self) -> Problem:
         """The last programme solved."""
-        return self.outcome.program
+        return self.outcome.problem
 
     @cached_property
     def steps(self) -> tuple[tuple[str, Solution], ...]:
@@ -118,7 +117,7 @@ class Fit(Rendered):
         """Values at the solution of everything a constraint may refer to, by name, in the units of ``data``."""
         if not self.solution.has_point:
             return {}
-        problem: Problem = self.program.core
+        problem = self.problem
         return problem.named_quantities({name: self.solution.values[name] for name in problem.start})
 
     @cached_property
@@ -127,7 +126,7 @@ class Fit(Rendered):
 
         NaN for a stream whose statistics do not contain it.
         """
-        compressed = self.program.compressed
+        compressed = self.problem.compressed
         found = None if compressed is None else compressed.one_step_fit(self.solution.values)
         return self._fit("one step") if found is None else found
 
@@ -425,7 +424,7 @@ def resolve(fit: Fit, weights: Mapping[str, float], *, solver: Any = "auto", acc
     An unknown weight is a `StructureError`. The other arguments are as in `fit`.
     """
     started = time.perf_counter()
-    problem: Problem = fit.program.core
+    problem = fit.problem
     if not problem.weights:
         raise StructureError(f"{problem.name!r} has no penalties with weights")
     for name in weights:
@@ -438,7 +437,7 @@ def resolve(fit: Fit, weights: Mapping[str, float], *, solver: Any = "auto", acc
                      {"accuracy": accuracy, "solver": solver}, started)
 
 
-def _solved(problem: Program | Problem | Procedure, solvers: Solvers, settings: Mapping[str, Any], raises: bool,
+def _solved(problem: Problem | Procedure, solvers: Solvers, settings: Mapping[str, Any], raises: bool,
             started: float) -> Outcome:
     """Solve a problem that took the time since ``started`` to build."""
     built_at = time.perf_counter()
@@ -455,25 +454,24 @@ def _finished(outcome: Outcome, data: Data | Stream, name: str, arguments: Mappi
               settings: Mapping[str, Any], started: float) -> Fit:
     _in_raw_units(outcome.model, data)  # a model without an equivalent in raw units is refused here
     findings = findings + _violated(outcome.model, arguments.get("constraints", ()))
-    compressed, words = outcome.program.compressed, ("rows", "candidates", "condition", "method")
+    compressed, words = outcome.problem.compressed, ("rows", "candidates", "condition", "method")
     told = {} if compressed is None else {word: getattr(compressed.statistics, word) for word in words}
     figures = {**told, **outcome.figures}
     findings = findings + examine_figures(figures)
-    prices = _prices(outcome.program, outcome.solution)
-    here = outcome.program.user_constraints
+    prices = _prices(outcome.problem, outcome.solution)
+    here = outcome.problem.constraint_names
     # multipliers of an earlier step are in units of its own objective, which have no price in points of fit
-    earlier = [replace(one, fit_points=np.nan) for name, (program, solution) in outcome.constrained.items()
-               if name not in here for one in _prices(program, solution) if one.name == name]
+    earlier = [replace(one, fit_points=np.nan) for name, (problem, solution) in outcome.constrained.items()
+               if name not in here for one in _prices(problem, solution) if one.name == name]
     log.debug("fit %s: %s by %s in %.3g s", name, outcome.solution.status, outcome.solution.solver,
               time.perf_counter() - started)
     return Fit(replace(outcome, figures=figures), name, arguments, data, (*prices, *earlier), tuple(findings),
                time.perf_counter() - started, settings)
 
 
-def _prices(program: Program, solution: Solution) -> tuple[Price, ...]:
+def _prices(problem: Problem, solution: Solution) -> tuple[Price, ...]:
     if not solution.has_point:
         return ()
-    problem: Problem = program.core
     x = {name: solution.values[name] for name in problem.start}
     return price_constraints(problem, x, solution.duals, solution.objective / problem.unit)
 
@@ -506,16 +504,16 @@ def _violated(model: Any, constraints: Sequence[Any]) -> list[str]:
 
 
 def _raise_failure(outcome: Outcome) -> None:
-    solution, program = outcome.solution, outcome.program
+    solution, problem = outcome.solution, outcome.problem
     if solution.status is Status.INFEASIBLE:
         from optid.certificate.infeasibility import explain
 
-        raise InfeasibleError(explain(program))
+        raise InfeasibleError(explain(problem))
     if solution.status is Status.UNBOUNDED:
-        raise UnboundedError(f"{program.name!r} has no minimum (according to {solution.solver}): the constraints or "
+        raise UnboundedError(f"{problem.name!r} has no minimum (according to {solution.solver}): the constraints or "
                              "the penalty leave a direction in which the objective falls without limit")
     if solution.status is Status.FAILED or not solution.has_point:
-        raise SolverFailed(f"{solution.solver} gave no usable answer for {program.name!r}: "
+        raise SolverFailed(f"{solution.solver} gave no usable answer for {problem.name!r}: "
                            f"{solution.reason or solution.claimed}. Try another solver (optid solvers)")
     if solution.status in (Status.INACCURATE, Status.LIMIT):
         warnings.warn(f"{solution.solver} stopped with status '{solution.status}': {solution.reason}", DataWarning,

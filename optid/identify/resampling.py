@@ -93,7 +93,7 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
 def _records(fit: Fit, runs: int, seed: int) -> Iterator[Data]:
     """Yield the resampled records, in the units of the record fitted."""
     data: Data = fit.data  # type: ignore[assignment]
-    model = fit.program.recover(fit.solution.values)
+    model = fit.problem.model(fit.solution.values)
     rows = np.vstack([e.y - model.predict_record(e.u, e.y) for e in data.experiments])
     rows = rows[~np.isnan(rows).any(axis=1)]
     # centred, with the variance of the equation error

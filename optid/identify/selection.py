@@ -72,7 +72,7 @@ def path(data: Data, formulation: str, *, penalty: str, weights: Sequence[float]
     grid = default_weights(train) if weights is None else np.sort(np.asarray(weights, dtype=float))
     fits, scores = [], []
     for weight in track(grid, f"path of {penalty}", len(grid)):
-        if fits and fits[-1].program.core is not None and penalty in fits[-1].program.core.weights:
+        if fits and penalty in fits[-1].problem.weights:
             one = resolve(fits[-1], {penalty: float(weight)}, solver=arguments.get("solver", "auto"))
         else:
             one = fit(train, formulation, **{**arguments, penalty: float(weight)})
@@ -105,7 +105,7 @@ def default_weights(data: Data) -> np.ndarray:
 
 def _ratio(one: Fit) -> float:
     """Largest ratio of the second to the first singular value over the channels."""
-    compressed = one.program.compressed
+    compressed = one.problem.compressed
     thetas = compressed.matrices(one.solution.values) if isinstance(compressed, EquationError) else ()
     values = [np.linalg.svd(theta, compute_uv=False) for theta in thetas]
     return max([0.0, *(float(v[1] / v[0]) for v in values if v.size > 1 and v[0] > 0)])

@@ -150,7 +150,7 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
         RankError: a parameter without effect on the predictions, such as the numerator of an input whose f is zero.
     """
     _refuse(fit)
-    problem: Problem = fit.program.core
+    problem: Problem = fit.problem
     compressed, found = problem.compressed, fit.solution.values
     shapes = {name: np.shape(value) for name, value in problem.start.items() if name not in problem.courses}
     x = np.concatenate([np.ravel(found[name], order="F") for name in shapes])
@@ -189,7 +189,7 @@ def _refuse(fit: Any) -> None:
         raise StructureError("the fit has no point, so that there are no intervals")
     if fit.solution.status is Status.LIMIT:
         raise StructureError(f"they hold at an optimum, and the solver stopped before one: {fit.solution.reason}")
-    if fit.program.compressed is None:
+    if fit.problem.compressed is None:
         advice = "; use optid.bootstrap" if fit.model is not None and fit.model.structure == "arx" else ""
         raise StructureError("they follow from compressed least squares, which "
                              f"{fit.formulation!r} does not keep{advice}")
@@ -197,7 +197,7 @@ def _refuse(fit: Any) -> None:
     if loss != "squares":
         raise StructureError(f"loss {loss!r} is not least squares, so that its standard errors do not follow from the "
                              "statistics; use optid.bootstrap")
-    if fit.program.core is not None and fit.program.core.weights.get("weight", 0.0) > 0:
+    if fit.problem.weights.get("weight", 0.0) > 0:
         raise StructureError("the nuclear norm shrinks Theta by an amount that no interval accounts for; refit with "
                              "'hammerstein_arx.exact', or use optid.bootstrap for the scatter about the shrunk value")
 

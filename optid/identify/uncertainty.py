@@ -235,8 +235,8 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
     """
     check_probability(level, "level")
     def rebuild(values: dict[str, Array]) -> Any:
-        model = fit.program.recover(values)
-        for transform in filter(None, (fit.program.compressed.outward, getattr(fit.data, "transform", None))):
+        model = fit.problem.model(values)
+        for transform in filter(None, (fit.problem.compressed.outward, getattr(fit.data, "transform", None))):
             model = model.with_transform(transform)
         return align_signs(model, fit.model)
 

@@ -190,7 +190,7 @@ def noise(fit: "Fit") -> Figure:
 def certificate(fit: "Fit") -> Figure:
     """Draw the steps of the proof of global optimality and the remaining gap."""
     bound = fit.solution.bound
-    ladder = RankOneForm.of(fit.program.core) is not None and bound is not None and bound.method in RUNGS
+    ladder = RankOneForm.of(fit.problem) is not None and bound is not None and bound.method in RUNGS
     figure = Figure(figsize=(9.0, 2.7 if ladder else 1.9), layout="constrained")
     axes = figure.subplots(2 if ladder else 1, 1, height_ratios=[1, 1.35] if ladder else None, squeeze=False)[:, 0]
     if ladder and bound is not None:

@@ -49,7 +49,7 @@ def verdict(fit: "Fit") -> tuple[str, str, str]:
         sentence = f"No model of {which} has a smaller objective on this record: global optimality is proved ({proof})."
         return "good", "optimal (proved)", sentence
     word = f"{solution.status} (not proved)" if solution.has_point else str(solution.status)
-    reason = (solution.reason or (bound.reason if bound is not None else "") or fit.program.note).rstrip(".")
+    reason = (solution.reason or (bound.reason if bound is not None else "") or fit.problem.no_proof).rstrip(".")
     because = f": {reason}" if reason else ""
     if solution.status not in (Status.LOCAL, Status.OPTIMAL):
         return "bad", word, f"The solver stopped early{because}. The figures below may be far from optimal."
@@ -111,7 +111,7 @@ def certificate_facts(fit: "Fit") -> Facts:
     s, r = fit.solution, fit.solution.residuals
     facts = [("Solver status", f"{s.solver}: {s.claimed}"), ("Solution returned", "yes" if s.has_point else "no")]
     if s.bound is None:
-        facts.append(("Optimality proved", "no: " + (fit.program.note or "this programme has no certificate")))
+        facts.append(("Optimality proved", "no: " + (fit.problem.no_proof or "this programme has no certificate")))
     else:
         facts.append(("Optimality proved", f"{'yes' if s.proof else 'no'}: {s.bound.reason or s.bound.method}"))
         known = np.isfinite(s.bound.value)
@@ -168,11 +168,11 @@ def theta_singular_values(fit: "Fit") -> dict[str, np.ndarray]:
 
     Inputs whose Theta is a vector are left out.
     """
-    compressed, found = fit.program.compressed, {}
-    heights = fit.program.core.facts.get("units")
+    compressed, found = fit.problem.compressed, {}
+    heights = fit.problem.facts.get("units")
     if not isinstance(compressed, EquationError) or not fit.solution.has_point:
         return found
-    if RankOneForm.of(fit.program.core) is not None:
+    if RankOneForm.of(fit.problem) is not None:
         z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear
         thetas = []
         for rows, columns in compressed.problem.blocks:
@@ -200,7 +200,7 @@ def channel_table(data: Data) -> Table:
 def solver_facts(fit: "Fit") -> Facts:
     """The solver, why it was chosen, and the time of each part."""
     s = fit.solution
-    descended = fit.figures.get("programmes") == 1 and not fit.program.user_constraints
+    descended = fit.figures.get("programmes") == 1 and not fit.problem.constraint_names
     facts = [("Solver", f"descent, {s.solver}" if descended else s.solver)]
     if s.chosen:
         facts.append(("Chosen because", s.chosen.partition(": ")[2] or s.chosen))
@@ -222,7 +222,7 @@ def steps_table(fit: "Fit") -> Table | None:
     rows = [(name, str(len(several)), ", ".join(dict.fromkeys(s.solver for s in several)), str(several[-1].status),
              number(several[-1].objective)) for name, several in by_name.items()]
     return Table("Steps", ("step", "programmes", "solver", "last status", "objective"), rows,
-                 f"The objective of the fit is that of the step '{fit.program.name}'.")
+                 f"The objective of the fit is that of the step '{fit.problem.name}'.")
 
 
 def call(fit: "Fit") -> str:

@@ -16,7 +16,6 @@ from optid.backends.back_end import Answer, Settings
 from optid.core.least_squares import RankOneForm
 from optid.core.leaves import Product
 from optid.core.problem import Problem
-from optid.core.program import Program
 from optid.core.terms import Values, flat
 from optid.program.sizes import GAUGE
 from optid.program.solution import Solution, Status
@@ -25,7 +24,7 @@ from optid.solving.solve import solve
 STEPS = 1000
 
 
-def run(program: Program, settings: Settings) -> Answer:
+def run(problem: Problem, settings: Settings) -> Answer:
     """Alternate from the start until the objective stops falling; the multipliers are those of the last two half-steps.
 
     Options: ``inner`` (word of the convex back end of the half-steps, default "clarabel"), ``steps`` (largest number of
@@ -34,13 +33,12 @@ def run(program: Program, settings: Settings) -> Answer:
     Raises:
         StructureError: a constraint that is not convex even with one factor held.
     """
-    form = RankOneForm.of(program.core)
+    form = RankOneForm.of(problem)
     assert form is not None
     options = dict(settings.options)
     inner, steps = str(options.pop("inner", "clarabel")), int(options.pop("steps", STEPS))
     if options:
         return Answer(Status.FAILED, f"unknown option {', '.join(sorted(options))}; known: inner, steps")
-    problem: Problem = program.core
     mus, bs = [mu for mu, _ in form.blocks], [b for _, b in form.blocks]
     point = dict(problem.start)
     accuracy = min(settings.accuracy, 1e-9)

@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from optid.backends.back_end import Answer, BackEnd, Settings
-from optid.core.program import Program
+from optid.core.problem import Problem
+from optid.core.statement import is_stated, statement_of
 from optid.errors import SolverRefused, StructureError
 from optid.packing import Unsendable
 from optid.processes import run_apart
@@ -15,20 +16,19 @@ from optid.program.solution import Status
 GRACE = 0.5  # seconds after its time limit at which a solver is killed
 
 
-def answer_of(program: Program, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
+def answer_of(problem: Problem, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
     """Run a back end from the programme's start, in another process where it is to be separate; every outcome counts.
 
     What only models and proofs need may stay here (`optid.packing.Absent`).
     """
-    program.clear_duals()
-    if settings.warm and program.start:
-        program.assign(program.start)
+    if is_stated(problem) or separate or not settings.warm:
+        statement_of(problem).begin(problem.start if settings.warm else {})
     if not separate:
-        return _run(back_end, program, settings)
+        return _run(back_end, problem, settings)
     clock = time.monotonic()
     try:
         limit = None if settings.time_limit is None else settings.time_limit + GRACE
-        return run_apart(_run, back_end, program, settings, seconds=limit, lenient=True)
+        return run_apart(_run, back_end, problem, settings, seconds=limit, lenient=True)
     except TimeoutError:
         return Answer(Status.LIMIT, f"stopped after {time.monotonic() - clock:.1f} s: it did not keep its time limit")
     except ChildProcessError as death:
@@ -38,10 +38,10 @@ def answer_of(program: Program, back_end: BackEnd, settings: Settings, separate:
                             "time_limit nor isolate") from refusal
 
 
-def _run(back_end: BackEnd, program: Program, settings: Settings) -> Answer:
+def _run(back_end: BackEnd, problem: Problem, settings: Settings) -> Answer:
     """Run a back end; its own exception is an answer, too, also in a child."""
     try:
-        return _wellformed(back_end.run(program, settings), program)
+        return _wellformed(back_end.run(problem, settings), problem)
     except Unsendable:
         raise
     except StructureError as refusal:  # its message has the remedy for the user
@@ -52,9 +52,9 @@ def _run(back_end: BackEnd, program: Program, settings: Settings) -> Answer:
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
 
 
-def _wellformed(answer: Answer, program: Program) -> Answer:
+def _wellformed(answer: Answer, problem: Problem) -> Answer:
     """Return an answer with the values of the programme's variables; one of another form is a failure."""
     if not isinstance(answer, Answer) or not isinstance(answer.status, Status) or not all(
             isinstance(one, Mapping) for one in (answer.values, answer.duals)):
         return Answer(Status.FAILED, "it returned no Answer(status: Status, word, values: Mapping, duals: Mapping)")
-    return replace(answer, values={name: value for name, value in answer.values.items() if name in program.shapes})
+    return replace(answer, values={name: value for name, value in answer.values.items() if name in problem.shapes})

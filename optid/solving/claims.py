@@ -12,7 +12,8 @@ from optid.certificate.convex import TANGENT
 from optid.certificate.infeasibility import satisfiable
 from optid.core.judge import judge
 from optid.core.least_squares import RankOneForm
-from optid.core.program import Program
+from optid.core.problem import Problem
+from optid.core.statement import class_of, complete_values, statement_of
 from optid.core.terms import Squares, Values
 from optid.program.sizes import GAUGE
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, relative_gap, tolerance
@@ -26,12 +27,12 @@ CONFLICT = "the constraints contradict each other"
 NOT_FINITE = "returned non-finite numbers"  # the reason of such a solution, after its solver
 
 
-def verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution, settings: Settings, prove: bool,
+def verdict(problem: Problem, back_end: BackEnd, answer: Answer, base: Solution, settings: Settings, prove: bool,
              separate: bool) -> Solution:
     """Return a solution with what an answer is worth, proved where that is asked for.
 
     Args:
-        program: the programme.
+        problem: the programme.
         back_end: the solver.
         answer: its answer.
         base: status, words and times of the answer.
@@ -44,19 +45,19 @@ def verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution,
     except (TypeError, ValueError) as error:
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} returned no numbers: {error}")
     if not values:
-        status, reason = _without_point(program, answer, back_end, settings)
-        if status is Status.FAILED and _contradictory(program):
+        status, reason = _without_point(problem, answer, back_end, settings)
+        if status is Status.FAILED and _contradictory(problem):
             return _conflict(base, reason)
         return replace(base, status=status, reason=reason)
     if not all(np.all(np.isfinite(value)) for value in values.values()):
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
-    if missing := program.shapes.keys() - values.keys():
+    if missing := problem.shapes.keys() - values.keys():
         return replace(base, status=Status.FAILED,
                        reason=f"{back_end.name} returned no value for {', '.join(sorted(missing))}")
 
     clock = time.perf_counter()
     try:
-        point = _judged(program, answer, base)
+        point = _judged(problem, answer, base)
     except ValueError as error:  # a value of another shape
         return replace(base, status=Status.FAILED,
                        reason=f"{back_end.name} returned a point that cannot be judged: {error}")
@@ -65,21 +66,21 @@ def verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution,
     if not abs(point.objective) <= LARGEST:  # models refuse such numbers, since their squares overflow
         return replace(point, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}", values={}, duals={})
     status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
-    if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
+    if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(problem):
         return _conflict(base, reason)
     bound: Bound | None = None
     unknown = bool(np.isnan(point.residuals.stationarity))  # only a bound can confirm the point
-    if status in (Status.LOCAL, Status.INACCURATE) and (prove and not program.step or unknown):
-        point, bound = _proof(program, back_end, settings, point, separate)
+    if status in (Status.LOCAL, Status.INACCURATE) and (prove and not problem.step or unknown):
+        point, bound = _proof(problem, back_end, settings, point, separate)
         assert point.residuals is not None
         outside = point.residuals.violation > tolerance(settings.accuracy)
         if bound is not None and bound.proved and outside:  # a point outside may well lie below the optimum
             bound = replace(bound, proved=False, reason=f"no proof: the point violates {point.residuals.worst!r}")
         if bound is not None and bound.proved and status is Status.LOCAL:
             status = Status.OPTIMAL
-        elif bound is not None and status is Status.LOCAL and _refuted(program, point, bound, settings.accuracy):
+        elif bound is not None and status is Status.LOCAL and _refuted(problem, point, bound, settings.accuracy):
             status, reason = Status.INACCURATE, f"the certified bound is not reached: {bound.reason}"
-        if status is Status.LOCAL and unknown and not _confirmed(program, back_end, settings, point, separate):
+        if status is Status.LOCAL and unknown and not _confirmed(problem, back_end, settings, point, separate):
             status, reason = Status.INACCURATE, f"{back_end.name} claims success, but {REFERENCE} finds a better point"
     done = time.perf_counter()
     return replace(point, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
@@ -91,17 +92,17 @@ def _conflict(base: Solution, reason: str) -> Solution:
     return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}")
 
 
-def _judged(program: Program, answer: Answer, base: Solution) -> Solution:
+def _judged(problem: Problem, answer: Answer, base: Solution) -> Solution:
     """Return a solution at the answer's point, with what we measured there.
 
     Where the solver's multipliers do not make it stationary, those count that come nearest to it.
     """
-    duals, problem = _usable(answer.duals), program.core
+    duals = _usable(answer.duals)
     x = {name: np.reshape(np.asarray(answer.values[name], dtype=float), np.shape(start), order="F")
          for name, start in problem.start.items()}
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
         found = judge(problem, x, duals)
-        values, structural = program.complete_values(x), {GAUGE: found.gauge} if problem.gauged else {}
+        values, structural = complete_values(problem, x), {GAUGE: found.gauge} if problem.gauged else {}
         if "residual" in values:
             structural["residual"] = duals.get("residual", -2.0 * values["residual"])
         if "structure" in duals:  # of a low-rank matrix
@@ -110,25 +111,25 @@ def _judged(program: Program, answer: Answer, base: Solution) -> Solution:
                    objective=found.objective, residuals=found.residuals)
 
 
-def _reference(program: Program, back_end: BackEnd) -> BackEnd | None:
+def _reference(problem: Problem, back_end: BackEnd) -> BackEnd | None:
     """Return another solver for a convex programme than the one that has solved it."""
     other = find(REFERENCE)
-    return None if program.kind == "NLP" or back_end is other or other.refuses(program) else other
+    return None if class_of(problem) == "NLP" or back_end is other or other.refuses(problem) else other
 
 
-def _confirmed(program: Program, back_end: BackEnd, settings: Settings, point: Solution, separate: bool) -> bool:
+def _confirmed(problem: Problem, back_end: BackEnd, settings: Settings, point: Solution, separate: bool) -> bool:
     """Whether another solver finds no better point of a convex programme with kinks, which has no multipliers of ours.
 
     The claim of that solver itself stands, and any of a programme that it does not take.
     """
-    other = _reference(program, back_end)
-    answer = None if other is None else answer_of(program, other, replace(settings, options={}), separate)
+    other = _reference(problem, back_end)
+    answer = None if other is None else answer_of(problem, other, replace(settings, options={}), separate)
     if answer is None or not answer.values:
         return True
-    best = _judged(program, answer, point)
+    best = _judged(problem, answer, point)
     assert best.residuals is not None
     outside = best.residuals.violation > tolerance(settings.accuracy)
-    return outside or relative_gap(point.objective, best.objective, program.scale) <= GRADIENT * tolerance(
+    return outside or relative_gap(point.objective, best.objective, problem.scale) <= GRADIENT * tolerance(
         settings.accuracy)
 
 
@@ -144,39 +145,39 @@ def _stationary(residuals: Residuals, accuracy: float) -> bool:
     return residuals.stationarity <= GRADIENT * limit and residuals.complementarity <= limit
 
 
-def _contradictory(program: Program) -> bool:
+def _contradictory(problem: Problem) -> bool:
     """Whether the constraints of a bilinear programme contradict each other: its descents cannot tell."""
-    problem = program.core
     return RankOneForm.of(problem) is not None and bool(problem.constraint_names) and not satisfiable(
-        program, list(problem.constraint_names))
+        problem, list(problem.constraint_names))
 
 
-def _without_point(program: Program, answer: Answer, back_end: BackEnd, settings: Settings) -> tuple[Status, str]:
+def _without_point(problem: Problem, answer: Answer, back_end: BackEnd, settings: Settings) -> tuple[Status, str]:
     """Judge a claim that comes without a point."""
     name = back_end.name
     if answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
         return Status.FAILED, f"{name} claims success, but returned no point"
     if answer.status is Status.INFEASIBLE:
-        if judge(program.core, program.core.start, {}).residuals.violation < 1e-9:
+        if judge(problem, problem.start, {}).residuals.violation < 1e-9:
             return Status.FAILED, f"{name} claims infeasibility, but the start satisfies every constraint"
-    if answer.status is Status.INFEASIBLE and satisfiable(program, list(program.user_constraints)):
-        if _refutable(program):
+    if answer.status is Status.INFEASIBLE and satisfiable(problem, list(problem.constraint_names)):
+        if _refutable(problem):
             return Status.FAILED, f"{name} claims infeasibility, but no constraints contradict each other"
-        if program.kind == "NLP":  # descents end where they can't go on, and say this of any place
+        if class_of(problem) == "NLP":  # descents end where they can't go on, and say this of any place
             return Status.FAILED, f"{name} claims infeasibility, which no convex relaxation of the constraints confirms"
     if answer.status is Status.UNBOUNDED:
-        if all(isinstance(term, Squares) for term in program.core.terms) or program.objective.expr.is_nonneg():
+        if all(isinstance(term, Squares) for term in problem.terms) or (
+                statement_of(problem).objective.expr.is_nonneg()):
             return Status.FAILED, f"{name} claims that there is no minimum, but the objective is never below zero"
-        other = _reference(program, back_end)
-        found = None if other is None else answer_of(program, other, replace(settings, options={}), False)
+        other = _reference(problem, back_end)
+        found = None if other is None else answer_of(problem, other, replace(settings, options={}), False)
         if found is not None and found.status is Status.OPTIMAL:
             return Status.FAILED, f"{name} claims that there is no minimum, but {REFERENCE} finds one"
     return answer.status, answer.word
 
 
-def _refutable(program: Program) -> bool:
+def _refutable(problem: Problem) -> bool:
     """Whether a point that satisfies a convex outer approximation of the constraints satisfies them all."""
-    return all(one.limit.member.is_dcp() for one in program.core.constraints())
+    return all(one.limit.member.is_dcp() for one in problem.constraints())
 
 
 def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) -> tuple[Status, str]:
@@ -205,35 +206,35 @@ def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) ->
     return Status.LOCAL, ""
 
 
-def _refuted(program: Program, point: Solution, bound: Bound, accuracy: float) -> bool:
+def _refuted(problem: Problem, point: Solution, bound: Bound, accuracy: float) -> bool:
     """Whether the dual bound of a convex programme leaves room for a better point, beyond the tolerance."""
-    if bound.proved or bound.method == TANGENT or not np.isfinite(bound.value) or program.kind == "NLP":
+    if bound.proved or bound.method == TANGENT or not np.isfinite(bound.value) or class_of(problem) == "NLP":
         return False
-    return relative_gap(point.objective, bound.value, program.scale) > tolerance(accuracy)
+    return relative_gap(point.objective, bound.value, problem.scale) > tolerance(accuracy)
 
 
-def _proof(program: Program, back_end: BackEnd, settings: Settings, point: Solution, separate: bool
+def _proof(problem: Problem, back_end: BackEnd, settings: Settings, point: Solution, separate: bool
            ) -> tuple[Solution, Bound | None]:
     """Ask for a proof; what the attempt proposes as a better start, and a wider search, may lead to a better point."""
-    bound, start = proof_of(program, point.values, point.duals)
+    bound, start = proof_of(problem, point.values, point.duals)
     if bound is None:
         return point, None
     if start is not None and not bound.proved:
-        point, bound = _lowered(program, start, back_end, settings, point, bound, separate)
-    if not bound.proved and back_end.thorough and relative_gap(point.objective, bound.value, program.scale) > OPEN:
+        point, bound = _lowered(problem, start, back_end, settings, point, bound, separate)
+    if not bound.proved and back_end.thorough and relative_gap(point.objective, bound.value, problem.scale) > OPEN:
         wider = replace(settings, options={**back_end.thorough, **settings.options})
-        point, bound = _lowered(program, program.start, back_end, wider, point, bound, separate)
+        point, bound = _lowered(problem, problem.start, back_end, wider, point, bound, separate)
     return point, bound
 
 
-def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Settings, point: Solution, bound: Bound,
+def _lowered(problem: Problem, start: Values, back_end: BackEnd, settings: Settings, point: Solution, bound: Bound,
              separate: bool) -> tuple[Solution, Bound]:
     """Solve again from a start, and certify the point found there where it lies lower."""
-    answer = answer_of(program.beginning(start), back_end, settings, separate)
+    answer = answer_of(problem.beginning(start), back_end, settings, separate)
     if answer.values:
-        again = _judged(program, answer, point)
+        again = _judged(problem, answer, point)
         assert again.residuals is not None and point.residuals is not None
         lower = again.objective < point.objective - 1e-10 * abs(point.objective)
         if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
-            point, bound = again, proof_of(program, again.values, again.duals)[0] or bound
+            point, bound = again, proof_of(problem, again.values, again.duals)[0] or bound
     return point, bound

@@ -10,25 +10,24 @@ from optid.core.group_sparse import GroupSparseForm
 from optid.core.least_squares import RankOneForm
 from optid.core.low_rank import LowRankForm
 from optid.core.problem import Problem
-from optid.core.program import Program
+from optid.core.statement import class_of
 from optid.core.terms import NuclearNorms, Squares, Values
 from optid.program.solution import Bound
 from optid.structures.rank_one import RankOne
 
 
-def proof_of(program: Program, values: Values, duals: Values) -> tuple[Bound | None, Values | None]:
+def proof_of(problem: Problem, values: Values, duals: Values) -> tuple[Bound | None, Values | None]:
     """Return a bound on the objective from a point and its multipliers, and a better start that the attempt proposes.
 
     No bound where the problem is not convex and nothing is known of its terms, or where none can be formed.
     """
-    problem: Problem = program.core
     x = {name: np.asarray(values[name], dtype=float) for name in problem.start}
-    if isinstance(problem.proof, str) and problem.proof:
-        return Bound.none(problem.proof), None
+    if problem.no_proof:
+        return Bound.none(problem.no_proof), None
     if callable(problem.proof):
         return problem.proof(problem, x, duals)
     if RankOneForm.of(problem) is not None:
-        return certify_rank_one(problem, x, program.max_size)
+        return certify_rank_one(problem, x)
     if GroupSparseForm.of(problem) is not None:
         return certify_groups(problem, x, duals), None
     if LowRankForm.of(problem) is not None:
@@ -36,7 +35,7 @@ def proof_of(program: Program, values: Values, duals: Values) -> tuple[Bound | N
     match problem.terms:
         case (Squares(lifted=RankOne(), z=z), NuclearNorms()) if z == tuple(problem.start):
             return certify_nuclear(problem, x, duals), None
-    kind = program.kind
+    kind = class_of(problem)
     try:
         return (None if kind == "NLP" else certify_convex(problem, x, duals, kind == "QP")), None
     except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape

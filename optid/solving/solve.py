@@ -8,7 +8,7 @@ from typing import Any
 from optid.backends.back_end import BackEnd, Settings
 from optid.backends.choice import AUTO, choose, fallbacks, find
 from optid.core.problem import Problem
-from optid.core.program import Program, programme_of
+from optid.core.statement import complete_values, for_solvers
 from optid.errors import SolverRefused
 from optid.processes import LONGEST
 from optid.program.solution import Bound, Solution, Status, Times
@@ -24,13 +24,13 @@ UNUSABLE = (Status.FAILED, Status.LIMIT)
 
 
 @one_thread
-def solve(problem: Program | Problem, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
+def solve(problem: Problem, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
           time_limit: float | None = None, isolate: bool | None = None, warm: bool = True, prove: bool = True,
           verbose: bool = False, **options: Any) -> Solution:
     """Solve one programme with one back end and judge the answer.
 
     Args:
-        problem: the programme, or a `optid.core.problem.Problem`.
+        problem: the programme.
         solver: the back end's word, "auto", or a `BackEnd` (or plain ``run`` function) of your own.
         accuracy: requested relative accuracy, translated for each solver.
         time_limit: seconds, infinity for none; implies a separate process, which is killed when it does not stop.
@@ -49,16 +49,16 @@ def solve(problem: Program | Problem, solver: str | BackEnd | Callable = "auto",
         SolverMissing: not installed (with the pip line).
         SolverRefused: the solver cannot take this class of programme; the message names the nonconvex part.
     """
-    program: Program = programme_of(problem)
+    problem = for_solvers(problem)
     chosen = ""
     if solver == "auto":
-        back_end, chosen = choose(program)
+        back_end, chosen = choose(problem)
     elif isinstance(solver, str):
         back_end = find(solver)
     else:
         back_end = solver if isinstance(solver, BackEnd) else BackEnd(
             getattr(solver, "__name__", "callable"), frozenset({"LP", "QP", "SOCP", "SDP", "conic", "NLP"}), solver)
-    refusal = back_end.refuses(program)
+    refusal = back_end.refuses(problem)
     if refusal:
         raise SolverRefused(refusal)
     settings = Settings(accuracy, time_limit, warm, verbose, options)
@@ -68,12 +68,12 @@ def solve(problem: Program | Problem, solver: str | BackEnd | Callable = "auto",
 
     def attempt(back_end: BackEnd, settings: Settings, chosen: str, spent: float = 0.0) -> Solution:
         clock = time.perf_counter()
-        answer = answer_of(program, back_end, settings, separate)
+        answer = answer_of(problem, back_end, settings, separate)
         seconds = spent + time.perf_counter() - clock
-        base = Solution(answer.status, answer.word, back_end.name, chosen=chosen, scale=program.scale,
+        base = Solution(answer.status, answer.word, back_end.name, chosen=chosen, scale=problem.scale,
                         iterations=answer.iterations, times=Times(solve=seconds, compile=answer.compile),
                         claim=answer.status)
-        return verdict(program, back_end, answer, base, settings, prove, separate).in_units(program.unit)
+        return verdict(problem, back_end, answer, base, settings, prove, separate).in_units(problem.unit)
 
     solution = attempt(back_end, settings, chosen)
     if not chosen or options:
@@ -82,7 +82,7 @@ def solve(problem: Program | Problem, solver: str | BackEnd | Callable = "auto",
     # of general nonlinear solvers that do not arrive another would spend its thousands of iterations as well
     ended = solution.status is Status.LIMIT and (outside or time_limit is None) and back_end.name not in AUTO["NLP"]
     if solution.status is Status.FAILED or ended:
-        for other in fallbacks(program, back_end.name):
+        for other in fallbacks(problem, back_end.name):
             found = attempt(other, settings, f"{other.name}: in place of {back_end.name}")
             if found.status is Status.INFEASIBLE or (found.has_point and found.status not in UNUSABLE):
                 return replace(found, failed=back_end.name)
@@ -151,26 +151,26 @@ class Outcome:
 
     model: Any  # the model, or None where no programme had a point
     solution: Solution  # that of the step whose objective is that of the fit: of its last programme
-    program: Program  # that programme
+    problem: Problem  # its programme
     steps: tuple[tuple[str, Solution], ...]  # every (name, solution) on the way; one entry for a plain programme
     # those of the evidence, and which solvers stood in for others
     figures: Mapping[str, Any] = field(default_factory=dict)
     # the last programme, with its solution, in which each user constraint stood: a procedure hands its constraints to
     # the steps they are about
-    constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
+    constrained: Mapping[str, tuple[Problem, Solution]] = field(default_factory=dict, repr=False)
     # with which a procedure judged the whole: solution and program then do not belong together; the solution has
     # no bound where the evidence has a function that returns it
     evidence: Evidence | None = None
 
 
-def run(problem: Program | Problem | Procedure, solver: Any = "auto", *, options: Mapping[str, Any] | None = None,
+def run(problem: Problem | Procedure, solver: Any = "auto", *, options: Mapping[str, Any] | None = None,
         **settings: Any) -> Outcome:
     """Solve a programme, or drive a procedure that yields programmes and returns the model, with settings of `solve`.
 
     The time that a procedure itself takes, between its programmes, counts as building.
 
     Args:
-        problem: the programme, a problem of the core, or a procedure that yields either.
+        problem: the programme, or a procedure that yields programmes.
         solver: as for `solve`, or `Solvers`: of a procedure, steps that do not take the one word run as "auto".
         options: native options, for the programmes that a named solver solves.
         settings: others of `solve`.
@@ -178,32 +178,32 @@ def run(problem: Program | Problem | Procedure, solver: Any = "auto", *, options
     Raises:
         SolverRefused: no programme takes the solver; other errors as of `solve`.
     """
-    constrained: dict[str, tuple[Program, Solution]] = {}
+    constrained: dict[str, tuple[Problem, Solution]] = {}
     steps: list[tuple[str, Solution]] = []
     solvers, last = solver if isinstance(solver, Solvers) else Solvers(solver), {}
 
-    def solve_step(program: Program) -> Solution:
+    def solve_step(program: Problem) -> Solution:
         asked = solvers.of(program)
         stands_in = asked == "auto" and (solvers.word != "auto" or solvers.named)
         solution = solve(program, asked, **settings, **({} if stands_in else options or {}))
         steps.append((program.name, solution))
-        constrained.update(dict.fromkeys(program.user_constraints, (program, solution)))
+        constrained.update(dict.fromkeys(program.constraint_names, (program, solution)))
         last[program.name] = program, solution
         return solution
 
-    if isinstance(problem, Program | Problem):
-        program: Program = programme_of(problem)
+    if isinstance(problem, Problem):
+        program = for_solvers(problem)
         solution = solve_step(program)
-        model = program.recover(solution.values) if solution.has_point else None
+        model = program.model(solution.values) if solution.has_point else None
         return Outcome(model, solution, program, tuple(steps), constrained=constrained)
     clock = time.perf_counter()
-    program = programme_of(next(problem))
+    program = for_solvers(next(problem))
     building = time.perf_counter() - clock
     while True:
         solution = solve_step(program)
         clock = time.perf_counter()
         try:
-            program = programme_of(problem.send(solution))
+            program = for_solvers(problem.send(solution))
             building += time.perf_counter() - clock
         except StopIteration as stop:
             found = stop.value
@@ -217,6 +217,6 @@ def run(problem: Program | Problem | Procedure, solver: Any = "auto", *, options
             solution = replace(solution, objective=found.objective, bound=bound, status=found.status,
                                reason=found.reason)
             if found.values is not None:
-                solution = replace(solution, values=program.complete_values(found.values))
+                solution = replace(solution, values=complete_values(program, found.values))
             figures = {**found.figures, **_substitutions(steps)}
             return Outcome(found.model, solution, program, tuple(steps), figures, constrained, found)

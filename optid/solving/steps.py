@@ -12,7 +12,7 @@ from typing import Any
 from optid.annotations import check_words
 from optid.backends.back_end import BackEnd
 from optid.backends.choice import back_ends, find
-from optid.core.program import Program
+from optid.core.problem import Problem
 from optid.errors import LookupFailed, SolverRefused, nearest
 from optid.registry import annotations
 
@@ -54,17 +54,17 @@ class Solvers:
     main: str = ""
     skips_main: bool = False
 
-    def of(self, program: Program) -> Solver:
+    def of(self, problem: Problem) -> Solver:
         """Return the solver of a programme: "auto" in a declared step that does not take the word.
 
         The main step takes it where that was declared; what a constraint makes of it, the solver may still refuse.
         """
         if self.named:
-            return self.named.get(program.name, "auto")
-        if not self.main or program.name == self.main and not self.skips_main or callable(self.word):
+            return self.named.get(problem.name, "auto")
+        if not self.main or problem.name == self.main and not self.skips_main or callable(self.word):
             return self.word
         one = find(self.word) if isinstance(self.word, str) and self.word != "auto" else self.word
-        return "auto" if isinstance(one, BackEnd) and one.refuses(program) else self.word
+        return "auto" if isinstance(one, BackEnd) and one.refuses(problem) else self.word
 
 
 def choose_solvers(name: str, formulation: Callable[..., Any], arguments: Mapping[str, Any], solver: Any) -> Solvers:

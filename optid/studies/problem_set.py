@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from optid.core.program import Program, programme_of
+from optid.core.problem import Problem
+from optid.core.statement import class_of, for_solvers, statement_of
 from optid.errors import OptidError, StudyError
 from optid.program.solution import Solution, Status
 from optid.solving.solve import solve
@@ -89,27 +90,27 @@ def write_problems(database: str | Path, folder: str | Path, study: str | None =
     return lines
 
 
-def _programmes(cell: Cell) -> list[tuple[Program, Solution]]:
+def _programmes(cell: Cell) -> list[tuple[Problem, Solution]]:
     """Return the programmes of a cell with optid's solutions, up to the first failure."""
-    found: list[tuple[Program, Solution]] = []
+    found: list[tuple[Problem, Solution]] = []
     with warnings.catch_warnings(), suppress(StopIteration, OptidError, ArithmeticError, np.linalg.LinAlgError):
         warnings.simplefilter("ignore")  # the row of the cell has the reason of a failure
-        problem = programme_of(build_problem(cell.formulation_name, load(cell).data, cell.constraints, cell.options))
-        program = problem if isinstance(problem, Program) else programme_of(next(problem))
+        problem = for_solvers(build_problem(cell.formulation_name, load(cell).data, cell.constraints, cell.options))
+        program = problem if isinstance(problem, Problem) else for_solvers(next(problem))
         while True:
             solution = solve(program, accuracy=ACCURACY, time_limit=cell.time_limit, prove=False)
             found.append((program, solution))
             if program is problem:
                 break
-            program = programme_of(problem.send(solution))
+            program = for_solvers(problem.send(solution))
     return found
 
 
-def standard_form(program: Program) -> StandardForm | None:
+def standard_form(program: Problem) -> StandardForm | None:
     """Return the standard form of a programme; None where it is not convex, or of cones other than those here."""
-    if program.kind == "NLP":
+    if class_of(program) == "NLP":
         return None
-    data, _, _ = program.problem.get_problem_data("CLARABEL")
+    data, _, _ = statement_of(program).problem.get_problem_data("CLARABEL")
     dims = data["dims"]
     offset = float(data["param_prob"].apply_parameters()[-3])  # of (P,) q, offset, A, b
     if dims.exp or dims.p3d or getattr(dims, "pnd", None):
@@ -121,7 +122,7 @@ def standard_form(program: Program) -> StandardForm | None:
     return StandardForm(weights, np.asarray(data["c"]), sp.csc_array(data["A"]), np.asarray(data["b"]), cones, offset)
 
 
-def _written(folder: Path, number: int, cell: Cell, program: Program, solution: Solution) -> dict[str, Any] | None:
+def _written(folder: Path, number: int, cell: Cell, program: Problem, solution: Solution) -> dict[str, Any] | None:
     """Write one programme, and return its line; None where it is not convex or its objective could not be verified."""
     form = standard_form(program) if solution.status in (Status.OPTIMAL, Status.LOCAL) else None
     if form is None:

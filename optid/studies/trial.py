@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.core.program import Program, programme_of
+from optid.core.problem import Problem
+from optid.core.statement import for_solvers
 from optid.data.readers import Format
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
@@ -120,8 +121,8 @@ def _first_programme(entry: FormulationEntry, record: Data) -> Any:
     """Return the programme of a formulation on a record, or the first one of a procedure."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        problem = programme_of(build_problem(entry.formulation, record, entry.constraints, entry.options))
-        return problem if isinstance(problem, Program) else programme_of(next(problem))
+        problem = for_solvers(build_problem(entry.formulation, record, entry.constraints, entry.options))
+        return problem if isinstance(problem, Problem) else for_solvers(next(problem))
 
 
 def build_problem(formulation: str, record: Data, constraints: Sequence[str], options: Mapping[str, Any]) -> Any:

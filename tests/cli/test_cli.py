@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 import optid
 from optid.cli.app import app
 from optid.cli.terminal import spread
-from optid.core.program import programme_of
+from optid.core.statement import for_solvers
 from optid.descriptions import describe
 from optid.examples import EXAMPLES, example
 from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, find_entry_points
@@ -291,13 +291,13 @@ def test_a_formulation_documents_the_variables_it_poses(name):
     function = find_entry_points(FORMULATIONS)[name].load()
     parameters = inspect.signature(function).parameters
     assert list(found.signature.parameters) == list(parameters)
-    problem = programme_of(function(data, **{key: value for key, value in offered.items() if key in parameters}))
+    problem = for_solvers(function(data, **{key: value for key, value in offered.items() if key in parameters}))
     if hasattr(problem, "view"):
         view = problem.view
     elif "shooting" in name or "ss.exact" in name or "lfr" in name:  # behind the steps that find the start
-        view = programme_of(last_programme(problem)).view
+        view = for_solvers(last_programme(problem)).view
     else:
-        view = programme_of(next(problem)).view
+        view = for_solvers(next(problem)).view
     courses = {"output y", "states of x", "x0"}  # with the names of a plant of equations
     own = {*plant.states, *plant.parameters, *courses} if name == "physical" else set()
     assert set(found.variables) == set(view) - own

@@ -12,7 +12,7 @@ from optid.core.constraint import symmetric_part
 from optid.core.judge import judge
 from optid.core.leaves import Product, Quantity
 from optid.core.problem import Problem
-from optid.core.program import as_program
+from optid.core.statement import class_of, for_solvers, statement_of
 from optid.core.terms import Errors, GroupNorms, Inner, Length, NuclearNorms, Squares, flat
 from optid.errors import StructureError
 from optid.identify.equation_error import EquationStructure, compress
@@ -157,15 +157,15 @@ def test_the_gradient_of_a_problem_is_that_of_its_value(m):
 @pytest.mark.parametrize("word", WORDS)
 def test_the_rows_of_a_word_are_those_of_its_programme(word):
     problem = exact_problem(2, [word])
-    program = as_program(problem)
-    _ = program.objective  # which states it
+    program = for_solvers(problem)
+    stated = statement_of(program)
     rng = np.random.default_rng(0)
     for _ in range(3):
         x = {name: value + 0.5 * rng.normal(size=np.shape(value)) for name, value in problem.start.items()}
-        program.assign(x)
+        statement_of(program).assign(x)
         held = problem.constraints(x)
         y = problem.leaf_values(x)
-        theirs = [(name, member) for name in program.user_constraints for member in program.constraints[name]]
+        theirs = [(name, member) for name in program.constraint_names for member in stated.constraints[name]]
         assert [one.name for one in held] == [name for name, _ in theirs] and not any(one.moving for one in held)
         for one, (_, member) in zip(held, theirs):
             assert one.violation(problem.space, y) > 0 or np.max(member.violation()) <= 1e-9
@@ -254,11 +254,11 @@ def test_any_other_quantity_is_a_leaf():
 def test_the_objective_of_a_programme_is_that_of_its_factored():
     for m in (1, 2):
         problem = exact_problem(1, m=m)
-        program = as_program(problem)
+        program = for_solvers(problem)
         x = {name: value + 0.1 for name, value in problem.start.items()}
-        program.assign(x)
-        _ = program.objective
-        assert float(np.asarray(program.objective.expr.value)) == pytest.approx(problem.value(x), rel=1e-10)
+        stated = statement_of(program)
+        stated.assign(x)
+        assert float(np.asarray(stated.objective.expr.value)) == pytest.approx(problem.value(x), rel=1e-10)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -277,7 +277,7 @@ def test_squares_join_into_one(seed):
 def test_a_term_that_is_no_expression_is_named():
     problem = Problem("a name", {"a": np.ones(2)}, (Errors(lambda y: None, lambda y: 0.0),))
     with pytest.raises(StructureError, match="Errors, a term of 'a name', is no expression of its unknowns"):
-        _ = as_program(problem).kind
+        _ = class_of(for_solvers(problem))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -13,7 +13,7 @@ from optid.core.judge import judge, largest_excess
 from optid.core.leaves import LeafSpace, Quantity
 from optid.core.prices import price_constraints
 from optid.core.problem import Problem
-from optid.core.program import as_program
+from optid.core.statement import for_solvers, is_stated, statement_of
 from optid.core.terms import GroupNorms, NuclearNorms, Squares
 from optid.errors import DataWarning, StructureError
 from optid.identify.equation_error import EquationStructure, compress
@@ -31,7 +31,7 @@ WORDS = [(), ("monotone:increasing",), ("odd", "gain:1"), ("range:-0.15,0.1",), 
 def solved(problem):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
-        solution = solve(as_program(problem), prove=False)
+        solution = solve(for_solvers(problem), prove=False)
     assert str(solution.status) in ("optimal", "locally optimal"), solution
     return {name: np.asarray(solution.values[name]) for name in problem.start}, solution
 
@@ -162,10 +162,10 @@ def test_signs_that_constraints_fix(words, fixed):
 
 def test_a_constrained_fit_states_nothing_in_cvxpy_until_it_is_needed():
     fit = optid.fit(RECORD, na=2, nb=2, nk=1, basis="triangular:6", constraints=["monotone:increasing", "gain:0.5"])
-    assert not fit.program.is_stated and fit.prices[1].binding and fit.solution.proof
-    assert set(fit.program.user_constraints) == {"monotone:increasing", "gain"}
-    assert fit.values["Theta"].shape == (6, 2) and not fit.program.is_stated
-    assert fit.program.problem.is_dcp() is False and fit.program.is_stated
+    assert not is_stated(fit.problem) and fit.prices[1].binding and fit.solution.proof
+    assert set(fit.problem.constraint_names) == {"monotone:increasing", "gain"}
+    assert fit.values["Theta"].shape == (6, 2) and not is_stated(fit.problem)
+    assert statement_of(fit.problem).problem.is_dcp() is False and is_stated(fit.problem)
 
 
 def test_what_is_wrong_with_a_constraint_is_said_when_it_is_posed():

@@ -12,7 +12,7 @@ from formulations.prediction_error import _problem as transfer_problem
 from optid.backends.back_end import Settings
 from optid.backends.conic import solve_with
 from optid.core.leaves import Affine, Product, Quantity
-from optid.core.program import as_program
+from optid.core.statement import class_of, for_solvers, is_stated, statement_of
 from optid.errors import StructureError
 from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.static_curve import static_curve
@@ -133,12 +133,12 @@ def test_a_step_in_rows_is_that_of_the_programme_in_cvxpy(seed, damping):
                      lambda v: {"gain": cp.sum(v["Theta"]) == 1.0 + cp.sum(v["a"])})
     at = fit.criterion.linearise(z0)
     program = fit.pose(z0, at, damping)
-    assert not program.is_stated and program.kind == "QP"
+    assert not is_stated(program) and class_of(program) == "QP"
     rows = solve_with("clarabel", program, Settings(1e-10))
-    assert not program.is_stated
+    assert not is_stated(program)
     stated = fit.pose(z0, at, damping)
     whole = solve_with("clarabel", stated, Settings(1e-10, options={"max_iter": 400}))
-    assert stated.is_stated and rows.status == whole.status
+    assert is_stated(stated) and rows.status == whole.status
     for name in fit.places.names:
         np.testing.assert_allclose(rows.values[name], whole.values[name], rtol=1e-4, atol=1e-5)
     for name in ("large", "gain"):
@@ -165,7 +165,7 @@ def test_a_quantity_of_the_unknowns_is_a_leaf_like_any_other():
     problem = fit.problem.subject_to(lambda v: {"small": v["size"] <= 0.5})
     problem = replace(problem, leaves=(*problem.leaves, size), facts={**problem.facts, "units": None})
     step = problem.tangent(x, fit.places.squares(x), None)
-    found = solve_with("clarabel", as_program(step, step=True), Settings(1e-10)).values
+    found = solve_with("clarabel", for_solvers(step), Settings(1e-10)).values
     change = float(2 * x["mu"] @ (found["mu"] - x["mu"]) + x["mu"] @ x["mu"])
     assert change <= 0.5 + 1e-7
 
@@ -179,17 +179,17 @@ def test_a_step_under_a_matrix_is_that_of_the_programme_in_cvxpy(seed):
     fit, z0 = fit_of(seed, definite, lambda v: {"large": v["Theta"] <= 0.4})
     at = fit.criterion.linearise(z0)
     program, stated = fit.pose(z0, at, 0.0), fit.pose(z0, at, 0.0)
-    assert program.kind == "SDP" == stated.kind
+    assert class_of(program) == "SDP" == class_of(stated)
     rows = solve_with("clarabel", program, Settings(1e-10))
-    assert not program.is_stated and rows.status == Status.OPTIMAL
+    assert not is_stated(program) and rows.status == Status.OPTIMAL
     whole = solve_with("clarabel", stated, Settings(1e-10, options={"max_iter": 400}))
-    assert stated.is_stated and stated.kind == "SDP"
+    assert is_stated(stated) and class_of(stated) == "SDP"
     for name in fit.places.names:
         np.testing.assert_allclose(rows.values[name], whole.values[name], rtol=1e-3, atol=1e-4)
     for name in ("large", "definite"):
         np.testing.assert_allclose(rows.duals[name], whole.duals[name], rtol=1e-2,
                                    atol=1e-3 * np.abs(whole.duals[name]).max())
-    dual, matrix = rows.duals["definite"].reshape(3, 3), stated.constraints["definite"][0].args[0]
-    stated.assign({name: rows.values[name] for name in fit.places.names})
+    dual, matrix = rows.duals["definite"].reshape(3, 3), statement_of(stated).constraints["definite"][0].args[0]
+    statement_of(stated).assign({name: rows.values[name] for name in fit.places.names})
     assert np.linalg.eigvalsh(dual)[0] > -1e-6 * np.abs(dual).max()
     assert abs(np.sum(dual * matrix.value)) < 1e-5 * np.abs(dual).max()

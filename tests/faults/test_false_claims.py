@@ -14,7 +14,7 @@ import optid
 from formulations.faults.refit import actuator, parameters
 from optid.backends import Answer, BackEnd
 from optid.backends.choice import choose
-from optid.core.program import programme_of
+from optid.core.statement import for_solvers
 from optid.errors import OptidError
 from optid.faults import (
     Fault,
@@ -189,7 +189,7 @@ def test_no_lie_about_a_programme_of_a_procedure_is_believed(case, monkeypatch):
     honestly, seen = solving.solve, Counter()
 
     def judged(problem, solver="auto", **settings):
-        program = programme_of(problem)
+        program = for_solvers(problem)
         best = honestly(program, solver, **settings)
         seen[program.name] += 1
         for liar, run in LIARS.items() if seen[program.name] <= 2 and best.has_point else ():

@@ -178,7 +178,7 @@ def test_states_without_noise_are_equations(found):
     agreeing(model, Data(u, inject(model, u, seed=1)), {"process": [0.3, 0.0], "output": [0.3, 0.3]})
 
 
-def test_user_constraints_only_raise_the_factor(found):
+def test_constraint_names_only_raise_the_factor(found):
     data = window(found, 2, Fault.step("sensor:y1", 8, 1.0))
     free = membership(found.model, data, solver="highs")
     held = membership(found.model, data, constraints=[lambda v: {"start": v["x"][0] == 0}])

@@ -8,6 +8,7 @@ from test_fault_injection import small
 
 from formulations.faults.profile import course_of_changes, random_walk
 from optid.backends import Answer, BackEnd
+from optid.core.statement import statement_of
 from optid.errors import DataError, SolverFailed, StructureError
 from optid.faults import Fault, dictionary, profile, scan, whiten
 from optid.faults.consistency.profiles import course_problem
@@ -121,8 +122,9 @@ def test_solvers_that_fail_or_lie(found):
 
     def liar(program, settings):
         values = {name: np.asarray(program.start.get(name, np.zeros(v.shape))) + 0.1
-                  for name, v in program.variables.items()}
-        return Answer(Status.OPTIMAL, "optimal", values, {name: np.zeros(0) for name in program.constraints})
+                  for name, v in statement_of(program).variables.items()}
+        duals = {name: np.zeros(0) for name in statement_of(program).constraints}
+        return Answer(Status.OPTIMAL, "optimal", values, duals)
 
     with pytest.raises(SolverFailed, match="not stationary"):
         profile(s, "sensor:y1", solver=BackEnd("liar", classes, liar))

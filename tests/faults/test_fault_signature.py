@@ -11,7 +11,7 @@ from test_fault_injection import small
 
 from optid.backends import Answer, BackEnd, find
 from optid.core.group_sparse import GroupSparseForm
-from optid.core.program import as_program
+from optid.core.statement import for_solvers, statement_of
 from optid.errors import LookupFailed, StructureError
 from optid.faults import (
     Fault,
@@ -128,7 +128,7 @@ def test_groups_ruled_out_are_zero_for_every_solver(found, limits):
         assert not own.provably_zero[group.label][group.onset]
 
 
-def test_user_constraints_bind_and_keep_a_proof(found, limits):
+def test_constraint_names_bind_and_keep_a_proof(found, limits):
     s = two(found)
     free = signature_estimate(s, limits)
     first = next(group for group in free.active if group.size.size == 1)
@@ -146,14 +146,14 @@ def test_user_constraints_bind_and_keep_a_proof(found, limits):
 
 def test_sizes_are_in_the_units_of_the_fault(found, limits):
     s = two(found)
-    program = as_program(next(fault_formulation("fault.signature")(s, limits)))
+    program = for_solvers(next(fault_formulation("fault.signature")(s, limits)))
     atoms = {atom.label: atom for atom in atoms_of(s, limits)}
     rng = np.random.default_rng(0)
-    for name, variable in program.variables.items():
+    for name, variable in statement_of(program).variables.items():
         if name.startswith("a["):
             variable.value = rng.normal(size=variable.shape)
     for label in ("sensor:y1", "state"):
-        a, size = program.view[f"a[{label}]"].value, program.view[f"size[{label}]"].value
+        a, size = statement_of(program).view[f"a[{label}]"].value, statement_of(program).view[f"size[{label}]"].value
         t = 7
         onset = int(atoms[label].onsets[t])
         left = (s.signature(label, onset) @ size[t]).ravel()

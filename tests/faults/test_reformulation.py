@@ -14,7 +14,7 @@ from formulations.constraints.shape import monotone
 from formulations.faults.refit import actuator, parameters
 from optid import Data
 from optid.bases import Polynomial, Triangular
-from optid.core.program import as_program
+from optid.core.statement import class_of, for_solvers
 from optid.errors import DataError, DataWarning, LookupFailed, RankError, StructureError
 from optid.faults import (
     Certificate,
@@ -213,7 +213,7 @@ def test_refit_is_the_same_by_any_back_end(healthy, solver):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), seed=1, count=ONSET + 10)
     problem = refitting(healthy, data, damaged(1))
     stated = actuator(problem)
-    assert as_program(stated).kind == "QP"
+    assert class_of(for_solvers(stated)) == "QP"
     found, other = solve(stated, solver), solve(stated, "piqp")
     assert found.objective == pytest.approx(other.objective, rel=1e-5)
 

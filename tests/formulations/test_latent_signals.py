@@ -397,7 +397,7 @@ def test_tables_figures_and_checks_show_the_latent_function():
     share = np.mean(np.abs(further) > 1)
     assert found.outside["z"] == pytest.approx(share) and share > 0.02
     assert any("of latent signal 'z' lies outside the interval [-1, 1]" in note for note in found.notes)
-    found = fit.program.recover(fit.solution.values)  # not a point with the same errors to first order
+    found = fit.problem.model(fit.solution.values)  # not a point with the same errors to first order
     assert found.A == pytest.approx(fit.model.A, rel=1e-6) and found.latent[0].mu == pytest.approx(
         fit.outcome.model.latent[0].mu, rel=1e-5, abs=1e-12)
     band = fit.uncertainty.band(0, family="latent")

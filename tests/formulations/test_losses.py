@@ -23,8 +23,8 @@ def soiled():
 
 def threshold(fit, kind, number):
     """The width in units of the output, from the residuals of the pass in which the scale settled."""
-    theta, layout = regression(fit, fit.steps[2][1]), fit.program.compressed.layout
-    phi, y = dense(soiled(), layout.na, layout.nb, layout.nk, fit.program.compressed.bases)
+    theta, layout = regression(fit, fit.steps[2][1]), fit.problem.compressed.layout
+    phi, y = dense(soiled(), layout.na, layout.nb, layout.nk, fit.problem.compressed.bases)
     return number * np.median(np.abs(y - phi @ theta)) / 0.6745
 
 

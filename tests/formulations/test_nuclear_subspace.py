@@ -14,7 +14,7 @@ from optid.backends.choice import choose
 from optid.certificate.low_rank import certify_low_rank
 from optid.core.low_rank import LowRankForm
 from optid.core.problem import Problem
-from optid.core.program import as_program
+from optid.core.statement import for_solvers
 from optid.core.terms import Squares
 from optid.errors import DataWarning, InfeasibleError, RankError, SolverFailed, StructureError
 from optid.identify.subspace.low_rank import held_out_fit, structure
@@ -134,7 +134,7 @@ def test_every_back_end_ends_at_the_same_objective(form, missing):
 def programme(**arguments):
     plan = Plan("subspace.nuclear", data(count=50, noise=0.2), 2, 4, "linear", None, "projection")
     structured = structure(plan)
-    return structured, as_program(low_rank(structured, structured.penalty(20.0), **arguments))
+    return structured, for_solvers(low_rank(structured, structured.penalty(20.0), **arguments))
 
 
 def test_the_bound_is_recomputed_whatever_a_solver_says():
@@ -143,7 +143,7 @@ def test_the_bound_is_recomputed_whatever_a_solver_says():
     rng = np.random.default_rng(0)
     for scale in (0.0, 1e-3, 1.0, 1e6):
         wrong = {"structure": own.duals["structure"] + scale * rng.normal(size=own.duals["structure"].size)}
-        bound = certify_low_rank(program.core, own.values, wrong)
+        bound = certify_low_rank(program, own.values, wrong)
         assert bound.value <= own.objective * (1 + 1e-9)
         assert bound.proved or scale
         assert np.linalg.norm(bound.multipliers, 2) <= 1 + 1e-9
@@ -159,10 +159,10 @@ def test_the_bound_is_recomputed_whatever_a_solver_says():
 def test_the_programme_chooses_the_admm_unless_something_else_is_asked_of_it():
     _, program = programme()
     assert choose(program)[0].name == "admm"
-    bounded = as_program(program.core.subject_to(lambda view: {"ceiling": view["output"] <= 4.0}))
+    bounded = for_solvers(program.subject_to(lambda view: {"ceiling": view["output"] <= 4.0}))
     assert choose(bounded)[0].name == "clarabel"
     assert "takes no further constraints ('ceiling')" in find("admm").refuses(bounded)
-    assert "admm solves nuclear" in find("admm").refuses(as_program(Problem("other", {"x": np.zeros(2)}, (
+    assert "admm solves nuclear" in find("admm").refuses(for_solvers(Problem("other", {"x": np.zeros(2)}, (
         Squares(np.eye(2), np.ones(2), 0.0, ("x",)),))))
     free, held = solve(program), solve(bounded)
     assert held.status in (Status.OPTIMAL, Status.LOCAL) and held.objective >= free.objective - 1e-7
@@ -171,7 +171,7 @@ def test_the_programme_chooses_the_admm_unless_something_else_is_asked_of_it():
 def test_weights_are_changed_in_one_problem():
     structured, program = programme()
     first = solve(program)
-    second = solve(program.core.under_weights(weight=structured.penalty(200.0)))
+    second = solve(program.under_weights(weight=structured.penalty(200.0)))
     assert second.objective > first.objective
     again = solve(low_rank(structured, structured.penalty(200.0)))
     assert again.objective == pytest.approx(second.objective, rel=1e-6)
@@ -179,7 +179,7 @@ def test_weights_are_changed_in_one_problem():
 
 def test_an_iteration_limit_is_reported():
     def hasty(program, settings):
-        if LowRankForm.of(program.core) is None:
+        if LowRankForm.of(program) is None:
             return find("clarabel").run(program, settings)
         return find("admm").run(program, replace(settings, options={"limit": 3}))
 

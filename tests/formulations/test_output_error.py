@@ -14,6 +14,7 @@ from systems import by_hand, nonlinearity, siso
 import optid
 from formulations.constraints import shape
 from optid.bases import Linear, Polynomial, Triangular
+from optid.core.statement import statement_of
 from optid.data.channels import Transform
 from optid.errors import DataError, DataWarning, InfeasibleError, RankError, StructureError
 from optid.identify.prediction_error import descent, search
@@ -228,7 +229,7 @@ def test_simulations_do_not_depend_on_the_gauge(gauge, words):
 def test_offset_can_be_held_at_zero():
     data = record(siso(basis=BASIS, offset=0.0))
     fit = fitted(data, offset=False)
-    assert fit.model.offset[0] == 0.0 and "offset" not in fit.program.variables
+    assert fit.model.offset[0] == 0.0 and "offset" not in statement_of(fit.problem).variables
     same = fitted(data, constraints=[shape.fixed("offset", [0.0])])
     assert same.solution.objective == pytest.approx(fit.solution.objective, rel=1e-7)
 

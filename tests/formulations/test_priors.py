@@ -104,7 +104,7 @@ def test_several_channels_functions_and_missing_samples():
     hammerstein = optid.fit(Data(u[:, 0], y[:, 0]), "hammerstein_arx.exact", na=6, nb=6, nk=1, basis="polynomial:2",
                             prior="tc")
     assert hammerstein.solution.status.value == "optimal"
-    layout = hammerstein.program.compressed.layout
+    layout = hammerstein.problem.compressed.layout
     assert [[list(part) for part in group] for group in families(layout)] == [
         [list(range(6))], [list(range(6, 18, 2)), list(range(7, 18, 2))]]
 

@@ -74,7 +74,7 @@ def test_the_exact_model_obeys_and_is_the_global_optimum(name, gain):
     data = record(gain, count=80, noise=0.8, seed=1)
     fit = optid.fit(data, na=2, nb=2, basis=BASIS, constraints=[rule])
     assert holds(fit.model)
-    best = known_direction(data) if name == "known b" else search(fit.program, 48)
+    best = known_direction(data) if name == "known b" else search(fit.problem, 48)
     assert fit.solution.objective == pytest.approx(best, rel=1e-6)
     assert fit.solution.bound.value <= best * (1 + 1e-7)
 
@@ -206,7 +206,7 @@ def test_a_direction_of_b_decides_the_sign_of_a_monotone_f(gain):
     assert np.all(fit.model.b[0] >= 0) and fit.solution.proof
     wrong = [shape.sign("b"), shape.monotone("decreasing" if gain > 0 else "increasing")]
     worse = optid.fit(data, na=2, nb=2, basis=BASIS, constraints=wrong)
-    assert worse.solution.objective == pytest.approx(search(worse.program, 48), rel=1e-5)
+    assert worse.solution.objective == pytest.approx(search(worse.problem, 48), rel=1e-5)
     assert worse.solution.objective > 2 * fit.solution.objective
 
 

@@ -217,7 +217,7 @@ def test_regions_that_exclude_each_other_are_named():
 
     outcome = run(procedure())
     assert outcome.model is None and outcome.solution.status is Status.INFEASIBLE
-    text = explain(outcome.program)
+    text = explain(outcome.problem)
     assert "disc:0,0.3" in text and "strip:0.5,0.9" in text and "stable" not in text
 
 

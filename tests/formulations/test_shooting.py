@@ -10,7 +10,7 @@ import optid
 from formulations.constraints import shape
 from formulations.simultaneous import hammerstein_oe
 from optid.bases import Polynomial
-from optid.core.program import as_program
+from optid.core.statement import class_of, for_solvers, statement_of
 from optid.data.record import Data
 from optid.errors import DataError, OptidError, RankError, StructureError
 from optid.models import HammersteinTF, Nonlinearity
@@ -96,12 +96,12 @@ def test_constraints_on_the_simulated_output_and_nonconvex_ones():
 
 
 def test_start_satisfies_the_programme_and_judging_is_ours():
-    program = as_program(hammerstein_oe(plain((150, 100), gaps=0.1), **ORDERS))
-    program.assign(program.start)
-    for group in program.constraints.values():
+    program = for_solvers(hammerstein_oe(plain((150, 100), gaps=0.1), **ORDERS))
+    statement_of(program).assign(program.start)
+    for group in statement_of(program).constraints.values():
         for member in group:
             assert np.max(np.abs(member.violation())) < 1e-9
-    assert program.kind == "NLP"
+    assert class_of(program) == "NLP"
 
 
 @pytest.mark.parametrize(("name", "channels", "orders"), [

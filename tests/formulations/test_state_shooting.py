@@ -71,8 +71,8 @@ def test_subspace_starts_without_a_descent(case):
     ours = optid.fit(data, f"{name}.shooting", solver="ipopt", iterations=0, **options, **weights)
     theirs = optid.fit(data, f"{name}.exact", **options, **weights)
     assert ours.solution.objective == pytest.approx(theirs.solution.objective, rel=1e-6)
-    ours.program.assign(ours.program.start)
-    assert ours.program.objective.value > (1 + 1e-9) * ours.solution.objective
+    ours.problem.assign(ours.problem.start)
+    assert ours.problem.objective.value > (1 + 1e-9) * ours.solution.objective
 
 
 @pytest.mark.sampled(1)
@@ -86,7 +86,7 @@ def test_gaps_and_several_experiments(weighting):
     assert ours.values["states[2]"].shape == (150, 2)
     for i, (one, other) in enumerate(zip(ours.model.simulate(data, x0="fit"), theirs.model.simulate(data, x0="fit"))):
         assert one == pytest.approx(other, abs=1e-5 * np.abs(other).max())
-        course = ours.program.view[f"output[{i + 1}]"].value
+        course = ours.problem.view[f"output[{i + 1}]"].value
         assert course.shape == one.shape
 
 
@@ -108,7 +108,7 @@ def test_courses_are_in_units_of_the_record():
     data = record("hammerstein")
     data = Data(data.u, 100.0 + 40.0 * data.y)
     free = optid.fit(data, "hammerstein_ss.shooting", solver="ipopt", nx=2)
-    first = float(free.program.view["output"].value[0, 0])
+    first = float(free.problem.view["output"].value[0, 0])
     assert first == pytest.approx(free.model.simulate(data, x0="fit")[0, 0], rel=1e-6)
 
 

@@ -10,6 +10,7 @@ from systems import by_hand
 
 import optid
 from optid.bases import Triangular
+from optid.core.statement import statement_of
 from optid.models import HammersteinTF, Nonlinearity
 
 BASIS = Triangular(6).with_interval(-1.0, 1.0)
@@ -59,10 +60,10 @@ def raw_problem(phi, y, na, shapes, loss, weight=0.0, constrain=lambda a, thetas
 def with_b_given(program):
     """Return the CVXPY problem that is left of a bilinear programme for a given b, and the parameter for b."""
     b = cp.Parameter(2, value=np.array([1.0, 0.0]))
-    swap = {id(program.variables["b"]): b}
-    left = [member.tree_copy(swap) for name, group in program.constraints.items() if name != "gauge"
+    swap = {id(statement_of(program).variables["b"]): b}
+    left = [member.tree_copy(swap) for name, group in statement_of(program).constraints.items() if name != "gauge"
             for member in group]
-    return cp.Problem(program.objective.tree_copy(swap), left), b  # those of b alone hold or not
+    return cp.Problem(statement_of(program).objective.tree_copy(swap), left), b  # those of b alone hold or not
 
 
 def search(program, points=72):
@@ -93,7 +94,7 @@ def search(program, points=72):
 def regression(fit, solution=None):
     """Coefficients (columns, l) of the dense regressor in the units of the record, of a fit or of one of its steps."""
     fit = fit if solution is None else replace(fit, outcome=replace(fit.outcome, solution=solution))
-    values, ny, layout = fit.values, fit.data.l, fit.program.compressed.layout
+    values, ny, layout = fit.values, fit.data.l, fit.problem.compressed.layout
     a = values.get("a", np.zeros(0))
     rows = [np.reshape(a, (ny, -1), order="F" if ny > 1 else "C").T if a.size else np.zeros((0, ny))]
     for name in layout.inputs:

@@ -10,11 +10,13 @@ from optid.backends import Answer, BackEnd, Settings
 from optid.conformance.zoo import Case, cases
 from optid.core.form import Form
 from optid.core.problem import Problem
-from optid.core.program import Program, as_program
+from optid.core.statement import for_solvers
 from optid.core.terms import Expressed
 from optid.program.solution import Status
 
 CASES: dict[str, Case] = {case.name: case for case in cases()}
+
+
 class Anything(Form):
     """The form of any problem, with constraints."""
 
@@ -32,7 +34,7 @@ def case(name: str) -> Case:
     return CASES[name]
 
 
-def pose(name: str, objective, constraints: dict, variables, start=None, expressions=None, **parts) -> Program:
+def pose(name: str, objective, constraints: dict, variables, start=None, expressions=None, **parts) -> Problem:
     """State a problem of plain parts in given CVXPY variables, and return it as a programme."""
 
     def swapped(one, v):
@@ -44,7 +46,7 @@ def pose(name: str, objective, constraints: dict, variables, start=None, express
 
     begin = {one.name(): np.zeros(one.shape) for one in variables}
     begin |= {key: np.asarray(value, dtype=float) for key, value in (start or {}).items()}
-    return as_program(Problem(
+    return for_solvers(Problem(
         name, begin, (Expressed(lambda v: swapped(objective, v)),), restrictions=(build,),
         further=None if expressions is None else lambda v, _: {
             key: swapped(one, v) for key, one in expressions.items()},
@@ -57,22 +59,22 @@ def claiming(values: dict, status: Status = Status.OPTIMAL, duals: dict | None =
              word: str = "optimal") -> BackEnd:
     """A back end that always gives this answer."""
 
-    def run(program: Program, settings: Settings) -> Answer:
+    def run(program: Problem, settings: Settings) -> Answer:
         return Answer(status, word, {k: np.asarray(v, dtype=float) for k, v in values.items()}, duals or {})
 
     return BackEnd("liar", EVERYTHING, run, takes=anything)
 
 
-def _raise(program: Program, settings: Settings) -> Answer:
+def _raise(program: Problem, settings: Settings) -> Answer:
     raise ZeroDivisionError("inside the solver")
 
 
-def _abort(program: Program, settings: Settings) -> Answer:
+def _abort(program: Problem, settings: Settings) -> Answer:
     faulthandler.disable()  # the test runner would print the stack of a death that is intended
     os.abort()
 
 
-def _hang(program: Program, settings: Settings) -> Answer:
+def _hang(program: Problem, settings: Settings) -> Answer:
     while True:
         time.sleep(0.01)
 

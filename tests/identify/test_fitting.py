@@ -12,6 +12,7 @@ from zoo import anything
 import optid
 from formulations import hammerstein_arx
 from optid.backends import Answer, BackEnd
+from optid.core.statement import statement_of
 from optid.errors import DataError, DataWarning, LookupFailed, RankError, SolverFailed, StructureError
 from optid.program.solution import Status
 
@@ -30,13 +31,15 @@ def truth(program, settings):
 
 
 def liar(program, settings):
-    return Answer(Status.OPTIMAL, "all well", {name: 3.0 * np.ones(v.shape) for name, v in program.variables.items()})
+    variables = statement_of(program).variables
+    return Answer(Status.OPTIMAL, "all well", {name: 3.0 * np.ones(v.shape) for name, v in variables.items()})
 
 
 def lazy(program, settings):
-    values = dict(program.start) | {"residual": np.zeros(program.variables["residual"].shape)}
+    stated = statement_of(program)
+    values = dict(program.start) | {"residual": np.zeros(stated.variables["residual"].shape)}
     return Answer(Status.LOCAL, "all well", values,
-                  {name: np.zeros(sum(c.size for c in group)) for name, group in program.constraints.items()})
+                  {name: np.zeros(sum(c.size for c in group)) for name, group in stated.constraints.items()})
 
 
 def crashing(program, settings):
@@ -56,7 +59,8 @@ def empty(program, settings):
 
 
 def infinite(program, settings):
-    return Answer(Status.OPTIMAL, "done", {name: np.full(v.shape, np.nan) for name, v in program.variables.items()})
+    variables = statement_of(program).variables
+    return Answer(Status.OPTIMAL, "done", {name: np.full(v.shape, np.nan) for name, v in variables.items()})
 
 
 @pytest.mark.parametrize("run, words", [

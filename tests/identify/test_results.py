@@ -109,7 +109,7 @@ def test_a_pickled_fit_keeps_its_results_and_solves_again_when_its_programme_is_
     assert again.solution.proof and again.simulation_fit == fit.simulation_fit
     assert "outcome" not in vars(again)
     assert again.uncertainty.table() == fit.uncertainty.table()
-    assert again.program.user_constraints == fit.program.user_constraints
+    assert again.problem.constraint_names == fit.problem.constraint_names
 
 
 def test_a_constraint_that_cannot_be_pickled_is_named_when_it_is_needed():
@@ -117,12 +117,12 @@ def test_a_constraint_that_cannot_be_pickled_is_named_when_it_is_needed():
     again = pickle.loads(pickle.dumps(fit))
     assert again.model.equation() == fit.model.equation()
     with pytest.raises(StructureError, match="lambda"):
-        _ = again.program
+        _ = again.problem
 
 
 def test_a_copy_shares_the_programme():
     fit = linear_fit()
-    assert copy.copy(fit).program is fit.program
+    assert copy.copy(fit).problem is fit.problem
     with pytest.raises(AttributeError, match="no attribute 'modle'"):
         _ = fit.modle
 

@@ -116,7 +116,7 @@ def test_active_constraints_hold_the_intervals():
 
 def test_too_few_samples_are_refused():
     fit = fitted(record(0, samples=30))
-    few = replace(fit.program.compressed, at=replace(fit.program.compressed.at, rows=8))
+    few = replace(fit.problem.compressed, at=replace(fit.problem.compressed.at, rows=8))
     with pytest.raises(RankError, match="8 rows for 9 parameters"):
         few.spread(np.zeros((14, 1)), np.eye(14))
 

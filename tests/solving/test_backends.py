@@ -23,7 +23,7 @@ from optid.backends.dnlp import smooth
 from optid.conformance.checks import SUCCESS, ConformanceError, check_back_end, run_case, value_error
 from optid.conformance.zoo import planted_fit
 from optid.core.judge import judge
-from optid.core.program import as_program
+from optid.core.statement import class_of, for_solvers
 from optid.errors import StructureError
 from optid.program.solution import Status
 from optid.solving.solve import solve
@@ -62,9 +62,9 @@ def test_back_end_is_conformant(name):
 def test_every_class_has_a_solver_that_solves_all_of_it():
     for kind, name in {"LP": "clarabel", "QP": "clarabel", "SOCP": "clarabel", "SDP": "clarabel", "conic": "clarabel",
                        "NLP": "ipopt"}.items():
-        programmes = {c.name: as_program(c.build()) for c in CASES.values() if c.outcome == "solved"}
+        programmes = {c.name: for_solvers(c.build()) for c in CASES.values() if c.outcome == "solved"}
         rows = [run_case(back_ends()[name], CASES[key]) for key, one in programmes.items()
-                if one.kind == kind and not back_ends()[name].refuses(one)]
+                if class_of(one) == kind and not back_ends()[name].refuses(one)]
         assert rows and all(row.solution.status in SUCCESS and not row.complaints for row in rows), kind
 
 

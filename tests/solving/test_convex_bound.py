@@ -13,7 +13,7 @@ import optid
 from formulations.constraints import shape
 from optid.backends import Answer, BackEnd, back_ends
 from optid.certificate.convex import certify_convex
-from optid.core.program import programme_of
+from optid.core.statement import for_solvers, statement_of
 from optid.errors import DataWarning
 from optid.program.solution import Status
 from optid.registry import formulation
@@ -30,7 +30,7 @@ CONVEX = {
 
 def posed(name, data=None, constrained=True):
     word, arguments, constraints = CONVEX[name]
-    return programme_of(formulation(word)[1](record() if data is None else data,
+    return for_solvers(formulation(word)[1](record() if data is None else data,
                                              constraints=constraints if constrained else (), **arguments))
 
 
@@ -53,8 +53,8 @@ def test_any_multipliers_give_a_bound(seed, name, size):
     rng = np.random.default_rng(seed)
     wild = {key: dual + 10.0**size * rng.standard_normal(np.shape(dual)) for key, dual in best.duals.items()}
     point = {key: value + 0.1 * rng.standard_normal(np.shape(value)) for key, value in best.values.items()}
-    program.assign(point)
-    bound = certify_convex(program.core, program.values(), wild)
+    statement_of(program).assign(point)
+    bound = certify_convex(program, statement_of(program).values(), wild)
     assert program.unit * bound.value <= best.objective * (1 + 1e-8)
 
 
@@ -70,7 +70,7 @@ def test_good_multipliers_close_the_gap(name, constrained):
 def test_multipliers_of_our_own_serve_where_a_solver_gives_none(name):
     found, known = solve(posed(name), careless(0.0, duals=False)), solve(posed(name), "clarabel")
     assert found.status is Status.OPTIMAL and found.duals
-    assert "least-distance" in certify_convex(posed(name).core, known.values, {}).reason
+    assert "least-distance" in certify_convex(posed(name), known.values, {}).reason
     assert found.bound.value == pytest.approx(known.objective, rel=1e-7)
 
 
@@ -117,5 +117,5 @@ def test_a_smooth_programme_without_least_squares_is_bounded_by_a_tangent():
     program = pose("plain", cp.sum_squares(x - np.array([1.0, 2.0, 3.0])), {"cap": cp.sum(x) <= 3}, [x])
     found = solve(program, "clarabel", accuracy=1e-10)
     assert found.bound.method == "tangent" and found.bound.value <= 3.0 + 1e-9 and found.gap < 1e-6
-    far = certify_convex(program.core, {"x": np.array([1.0, 1.0, 1.0])}, {"cap": np.array([1.0])})
+    far = certify_convex(program, {"x": np.array([1.0, 1.0, 1.0])}, {"cap": np.array([1.0])})
     assert far.value <= 3.0 and not far.proved

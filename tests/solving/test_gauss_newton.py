@@ -48,7 +48,7 @@ def test_random_problems_converge_to_feasible_stationary_points(name, gain, seed
 def test_hard_cases_reach_the_global_optimum(name):
     fit = optid.fit(record(-1.0, count=60, noise=1.0, seed=5), na=2, nb=2, basis=BASIS, constraints=RULES[name],
                     prove=False)
-    assert fit.solution.objective == pytest.approx(search(fit.program), rel=1e-6)
+    assert fit.solution.objective == pytest.approx(search(fit.problem), rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["monotone", "slope", "through and radius", "cone"])
@@ -155,7 +155,7 @@ def test_an_optimum_on_one_lag_is_found_where_mu_vanishes_all_around(seed):
              shape.sign("b", ["positive", "negative"][seed // 2 % 2])]
     gain = [1.0, -1.0][seed % 2]
     fit = optid.fit(record(gain, count=60, noise=1.0, seed=seed), na=2, nb=2, basis=BASIS, constraints=rules)
-    assert fit.solution.objective <= search(fit.program, 36) * (1 + 1e-6)
+    assert fit.solution.objective <= search(fit.problem, 36) * (1 + 1e-6)
 
 
 def test_one_lag_is_tried_although_a_forbidden_direction_is_near():

@@ -11,7 +11,7 @@ import optid
 from formulations.constraints import shape
 from optid.certificate.infeasibility import conflicting_subset, explain, satisfiable
 from optid.core.problem import Problem
-from optid.core.program import programme_of
+from optid.core.statement import for_solvers
 from optid.core.terms import Inner
 from optid.errors import InfeasibleError, UnboundedError
 
@@ -41,7 +41,7 @@ SETS = {
 def program_of(rules, form="hammerstein_arx.exact"):
     from optid.registry import formulation
 
-    return programme_of(formulation(form)[1](record(), na=2, nb=2, basis=BASIS, constraints=rules))
+    return for_solvers(formulation(form)[1](record(), na=2, nb=2, basis=BASIS, constraints=rules))
 
 
 @pytest.mark.sampled(4)
@@ -57,7 +57,7 @@ def test_the_subset_is_named_and_irreducible(name):
     with pytest.raises(InfeasibleError) as caught:
         optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=rules)
     assert all(repr(one) in str(caught.value) for one in expected)
-    assert all(repr(one) not in str(caught.value) for one in set(program.user_constraints) - expected)
+    assert all(repr(one) not in str(caught.value) for one in set(program.constraint_names) - expected)
 
 
 @pytest.mark.parametrize("name", ["slope and gain", "stability", "a point outside the range", "three halves"])

@@ -9,7 +9,7 @@ import optid
 from formulations.constraints import shape
 from optid.certificate.lifting import lift
 from optid.core.least_squares import RankOneForm
-from optid.core.program import as_program
+from optid.core.statement import for_solvers, statement_of
 from optid.registry import formulation
 from optid.solving.proofs import proof_of
 
@@ -26,7 +26,7 @@ SETS = {
 
 
 def stated(data, **arguments):
-    return as_program(formulation("hammerstein_arx.exact")[1](data, na=2, nb=2, basis=BASIS, **arguments))
+    return for_solvers(formulation("hammerstein_arx.exact")[1](data, na=2, nb=2, basis=BASIS, **arguments))
 
 
 @pytest.mark.sampled(2)
@@ -34,7 +34,7 @@ def stated(data, **arguments):
 @pytest.mark.parametrize("name", SETS)
 def test_bounds_hold_and_proofs_are_true(name, gain, seed):
     fit = optid.fit(record(gain, count=50, noise=1.0, seed=seed), na=2, nb=2, basis=BASIS, constraints=SETS[name])
-    best = search(fit.program, 48)
+    best = search(fit.problem, 48)
     assert fit.solution.bound.value <= best * (1 + 1e-7)
     assert fit.solution.objective >= best * (1 - 1e-7)
     if fit.solution.proof:
@@ -75,34 +75,34 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
     """At random points of the factored problem both readings have the same left-hand sides."""
     rules = [shape.slope(0.5, 2.0), shape.dead_zone(-0.3, 0.3), lambda v: {"a": 2 * v["a"][0] - v["a"][1] <= 3}]
     program = stated(record(), constraints=rules, gauge=gauge)
-    lifted = lift(program.core, RankOneForm.of(program.core))
+    lifted = lift(program, RankOneForm.of(program))
     assert not lifted.refused and not lifted.cones
     rows, right, equal = lifted.linear.rows, lifted.linear.right, lifted.linear.equality
     rng = np.random.default_rng(1)
-    _ = program.objective  # which states it
+    _ = statement_of(program).objective  # which states it
     for _ in range(5):
         a, mu, b, d = rng.normal(size=2), rng.normal(size=6), rng.normal(size=2), rng.normal(size=1)
-        program.assign({"a": a, "mu": mu, "b": b, "offset": d})
+        statement_of(program).assign({"a": a, "mu": mu, "b": b, "offset": d})
         z = np.concatenate([a, d, np.kron(b, mu)])
         values = rows @ z - right
-        member = [np.ravel(c.expr.value, order="F") for name in program.user_constraints
-                  for c in program.constraints[name] if name in ("slope", "a")]
+        member = [np.ravel(c.expr.value, order="F") for name in program.constraint_names
+                  for c in statement_of(program).constraints[name] if name in ("slope", "a")]
         assert np.allclose(values[~equal], np.concatenate(member))
-        (zone,) = program.constraints["dead_zone:-0.3,0.3"]
+        (zone,) = statement_of(program).constraints["dead_zone:-0.3,0.3"]
         flat = np.ravel(zone.expr.value)
         assert np.allclose(values[equal], np.kron(b, flat))
 
 
 def test_products_of_two_cones():
     program = stated(record(), constraints=[lambda v: {"rising": BASIS.increments() @ v["mu"] >= 0}, shape.sign("b")])
-    lifted = lift(program.core, RankOneForm.of(program.core))
+    lifted = lift(program, RankOneForm.of(program))
     assert set(lifted.cones) == set(lifted.directions) == {0}
-    assert lifted.add_products(RankOneForm.of(program.core).problem) == [] and set(lifted.cones) == {0}
+    assert lifted.add_products(RankOneForm.of(program).problem) == [] and set(lifted.cones) == {0}
     rows, right, equal = lifted.linear.rows, lifted.linear.right, lifted.linear.equality
     assert not right.any() and not equal.any()
     mu, b = np.random.default_rng(2).normal(size=6), np.array([0.3, 2.0])
     z = np.concatenate([np.zeros(3), np.kron(b, mu)])
-    held = {one.name: one for one in program.core.constraints()}
+    held = {one.name: one for one in program.constraints()}
     curve, sign = held["rising"], held["sign:b:positive"]
     ratio = -rows @ z / np.kron(b / sign.sizes, BASIS.increments() @ mu / curve.sizes)
     assert ratio[0] > 0 and np.allclose(ratio, ratio[0])  # one factor, that of the units
@@ -110,14 +110,15 @@ def test_products_of_two_cones():
 
 def test_only_constraints_linear_in_the_products_are_lifted():
     program = stated(record(), constraints=[lambda v: {"mixed": v["Theta"][2, 1] - 3 * v["a"][1] <= 4}])
-    program.assign(program.start)
-    found = lift(program.core, RankOneForm.of(program.core))
-    (one,) = program.core.constraints()
+    statement_of(program).assign(program.start)
+    found = lift(program, RankOneForm.of(program))
+    (one,) = program.constraints()
     rows = found.linear.rows * one.sizes
     assert rows.shape == (1, 15) and found.linear.right * one.sizes == pytest.approx([4]) and not found.refused
-    unit = float(program.view["Theta"].value[2, 1] / program.view.inner["Theta"].value[2, 1])
+    view = statement_of(program).view
+    unit = float(view["Theta"].value[2, 1] / view.inner["Theta"].value[2, 1])
     assert dict(zip(np.flatnonzero(rows).tolist(), rows[rows != 0])) == pytest.approx({1: -3.0, 11: unit})
     for name, build in (("both", lambda v: v["mu"][0] + v["a"][0] <= 1),
                         ("ball", lambda v: cp.sum_squares(v["a"]) <= 1)):
         program = stated(record(), constraints=[lambda v, name=name, build=build: {name: build(v)}])
-        assert lift(program.core, RankOneForm.of(program.core)).refused == name
+        assert lift(program, RankOneForm.of(program)).refused == name

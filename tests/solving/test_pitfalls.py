@@ -14,23 +14,24 @@ from optid.backends import casadi as casadi_backend
 from optid.backends.dnlp import smooth
 from optid.conformance.zoo import planted_fit
 from optid.core.problem import Problem
-from optid.core.program import Program, as_program
+from optid.core.statement import for_solvers, statement_of
 from optid.errors import LookupFailed, StructureError
 from optid.program.solution import Status
 from optid.solving.solve import solve
 
 
-def through_cvxpy(program: Program, settings: Settings) -> Answer:
+def through_cvxpy(program: Problem, settings: Settings) -> Answer:
     """CVXPY's own interface to Uno, believed as it is."""
-    program.problem.solve(solver="UNO", nlp=True)
-    status = Status.OPTIMAL if program.problem.status == "optimal" else Status.FAILED
-    return Answer(status, program.problem.status, program.values(), program.duals())
+    stated = statement_of(program)
+    stated.problem.solve(solver="UNO", nlp=True)
+    status = Status.OPTIMAL if stated.problem.status == "optimal" else Status.FAILED
+    return Answer(status, stated.problem.status, stated.values(), stated.duals())
 
 
 # 1
 
 def test_1_success_at_an_infeasible_stationary_point_is_not_believed():
-    program = as_program(case("nlp_infeasible_stationary").build())
+    program = for_solvers(case("nlp_infeasible_stationary").build())
     believed = BackEnd("believed", frozenset({"NLP"}), through_cvxpy)
     claim = through_cvxpy(program, Settings())
     assert claim.word == "optimal"  # the evidence: x² = -1 has no solution
@@ -44,9 +45,9 @@ def test_1_multipliers_of_an_earlier_solve_are_not_handed_on():
     program = case("qp_equality").build()
     known = solve(program, "clarabel").duals["plane"]
 
-    def remembers(program: Program, settings: Settings) -> Answer:
-        assert program.duals() == {}
-        return Answer(Status.LOCAL, "done", {"x": np.array([1.0, 2.0, 2.0]) / 9}, program.duals())
+    def remembers(program: Problem, settings: Settings) -> Answer:
+        assert statement_of(program).duals() == {}
+        return Answer(Status.LOCAL, "done", {"x": np.array([1.0, 2.0, 2.0]) / 9}, statement_of(program).duals())
 
     assert known.size == 1
     assert solve(program, remembers).duals["plane"] == pytest.approx(known)  # ours
@@ -74,7 +75,7 @@ def test_2_zero_is_a_saddle_and_the_start_belongs_to_the_programme(name):
     free = solve(fit({"mu": np.ones(2), "b": np.ones(2)}), name)
     assert free.objective == pytest.approx(0.0, abs=1e-8)
     program = fit({"mu": np.ones(2), "b": np.ones(2)})
-    program.variables["mu"].value = np.zeros(2)  # what a variable happens to hold does not matter
+    statement_of(program).variables["mu"].value = np.zeros(2)  # what a variable happens to hold does not matter
     assert solve(program, name).objective == pytest.approx(0.0, abs=1e-8)
 
 
@@ -99,10 +100,10 @@ def test_3_multipliers_come_back_by_inverse_data_not_by_position(name):
 
 # 4
 
-def jacobian_entries(program: Program) -> int:
+def jacobian_entries(program: Problem) -> int:
     import casadi as ca
 
-    parts = casadi_backend.translate(smooth(program.problem))
+    parts = casadi_backend.translate(smooth(statement_of(program).problem))
     return ca.jacobian(parts["g"], parts["x"]).nnz()
 
 
@@ -161,7 +162,9 @@ def test_7_what_does_not_pass_the_suite_is_not_offered(name):
 def test_7_sqpmethod_indeed_does_not_pass():
     import casadi as ca
 
-    form = smooth(as_program(case("rank_one_fit").build()).problem)
+    stated = statement_of(for_solvers(case("rank_one_fit").build()))
+    stated.begin({})
+    form = smooth(stated.problem)
     quiet = {"print_time": False, "print_header": False, "print_iteration": False, "print_status": False,
              "error_on_fail": False, "qpsol": "qrqp", "max_iter": 50,
              "qpsol_options": {"print_iter": False, "print_header": False, "error_on_fail": False}}
@@ -179,7 +182,7 @@ def fit(gauge: str, **constraint) -> Problem:
     gauges = {"norm": cp.sum_squares(b) == 1, "b0": b[0] == 1}
     program = pose(f"fit {gauge}", cp.sum_squares(residual), {"gauge": gauges[gauge]}, [a, mu, b],
                    start={"a": np.zeros(1), "mu": np.array([-1.0, 0, 0, 1.0]), "b": np.array([1.0, 0.5])})
-    return program.core.subject_to(*(lambda v, name=name, build=build: {name: build(v["mu"])}
+    return program.subject_to(*(lambda v, name=name, build=build: {name: build(v["mu"])}
                                      for name, build in constraint.items()))
 
 
@@ -193,7 +196,7 @@ def test_8_a_bound_on_mu_means_something_only_under_its_normalisation():
 
 
 def test_8_there_is_no_automatic_relaxation():
-    assert not [name for name in dir(Program) if "relax" in name or "convexify" in name]
+    assert not [name for name in dir(Problem) if "relax" in name or "convexify" in name]
     refuses(StructureError, "not convex", solve, fit("norm"), "clarabel")
 
 
@@ -202,9 +205,10 @@ def test_8_there_is_no_automatic_relaxation():
 def test_9_hessians_are_exact():
     import casadi as ca
 
-    program = as_program(case("rank_one_fit").build())
+    program = for_solvers(case("rank_one_fit").build())
     assert solve(program, "ipopt").status in (Status.LOCAL, Status.OPTIMAL)
-    compiled = [value for value in program.problem._solver_cache["optid"].values() if isinstance(value, ca.Function)]
+    kept = statement_of(program).problem._solver_cache["optid"].values()
+    compiled = [value for value in kept if isinstance(value, ca.Function)]
     assert len(compiled) == 1 and compiled[0].stats()["n_call_nlp_hess_l"] > 0
 
 

@@ -14,7 +14,7 @@ from zoo import ABORTING, EVERYTHING, HANGING, RAISING, case, claiming, pose
 import optid
 from optid.backends import Answer, BackEnd, Settings, back_ends, choice
 from optid.core.problem import Problem
-from optid.core.program import as_program
+from optid.core.statement import for_solvers, statement_of
 from optid.core.terms import Squares
 from optid.errors import LookupFailed, SolverMissing, SolverRefused, StructureError
 from optid.program.solution import Bound, Solution, Status
@@ -88,7 +88,7 @@ def test_nothing_claimed_is_not_false():
 
 @pytest.mark.parametrize("values", [{}, {"x": np.array([NAN, 1.0])}, {"y": np.ones(2)}])
 def test_an_answer_without_a_usable_point_is_in_units_of_the_record(values):
-    found = solve(replace(projection().core, scale=3.0, unit=4.0), claiming(values, Status.LOCAL))
+    found = solve(replace(projection(), scale=3.0, unit=4.0), claiming(values, Status.LOCAL))
     assert found.status is Status.FAILED and found.scale == 12.0
 
 
@@ -226,7 +226,7 @@ def test_a_time_limit_that_is_no_positive_number_is_named(limit):
 
 
 def test_what_only_models_and_proofs_need_stays_here():
-    problem = replace(projection().core, model=lambda values: values, proof=lambda *_: (Bound(2.0, True, "hand"), None))
+    problem = replace(projection(), model=lambda values: values, proof=lambda *_: (Bound(2.0, True, "hand"), None))
     found = solve(problem, "clarabel", time_limit=30.0)
     assert found.status is Status.OPTIMAL and found.bound.method == "hand"
 
@@ -239,10 +239,10 @@ def test_a_pickled_programme_does_not_share_ids_with_what_is_made_after_it(monke
     from cvxpy.lin_ops.lin_utils import ID_COUNTER  # not public: this fails first if CVXPY counts otherwise
 
     objective = Squares(np.eye(2), np.full(2, 2.0), 0.0, ("x",))
-    packed = pickle.dumps(as_program(Problem("projection", {"x": np.zeros(2)}, (objective,), restrictions=(_budget,))))
+    packed = pickle.dumps(for_solvers(Problem("projection", {"x": np.zeros(2)}, (objective,), restrictions=(_budget,))))
     monkeypatch.setattr(ID_COUNTER, "count", 0)  # as in another process
     program = pickle.loads(packed)
-    known = {v.id for v in program.problem.variables()}
+    known = {v.id for v in statement_of(program).problem.variables()}
     assert not known & {cp.Variable().id for _ in range(max(known) + 1)}
     assert solve(program, "clarabel").values["x"] == pytest.approx([1.0, 1.0], abs=1e-6)
 
@@ -252,7 +252,7 @@ def test_a_pickled_programme_does_not_share_ids_with_what_is_made_after_it(monke
 @pytest.mark.parametrize("constraints", [(), (lambda view: {"first": view["mu"][0] <= 0.5},)])
 def test_a_programme_stated_late_starts_elsewhere_where_it_starts_here(solver, constraints):
     fit = optid.fit(record(), "hammerstein_arx.exact", na=1, nb=1, basis="triangular:4", constraints=constraints)
-    here, there = (solve(fit.program, solver, isolate=isolate) for isolate in (False, True))
+    here, there = (solve(fit.problem, solver, isolate=isolate) for isolate in (False, True))
     assert there.status is here.status and there.iterations == here.iterations
     assert there.objective == pytest.approx(here.objective, rel=1e-12)
 
@@ -304,7 +304,8 @@ def test_old_multipliers_do_not_survive():
     program = projection()
     assert "budget" in solve(program, "clarabel").duals
     found = solve(program, claiming({"x": [1.0, 1.0]}))
-    assert found.duals["budget"] == pytest.approx(2.0) and program.duals() == {}  # ours, not those of before
+    assert found.duals["budget"] == pytest.approx(2.0)
+    assert statement_of(program).duals() == {}  # ours, not those of before
 
 
 # paths and procedures
@@ -373,7 +374,7 @@ def test_a_word_of_a_limit_is_judged_as_any_other():
 
 
 def test_a_step_of_a_procedure_is_judged_without_a_bound():
-    program = as_program(case("qp_box").build())
+    program = for_solvers(case("qp_box").build())
     whole, step = solve(program, "clarabel"), solve(replace(program, step=True), "clarabel")
     assert whole.status is Status.OPTIMAL and whole.bound is not None
     assert step.status is Status.LOCAL and step.bound is None

@@ -95,7 +95,7 @@ def test_the_objective_is_that_of_the_main_step(solver):
     fit = fitted("subspace.nuclear", solver)
     by_step = dict(fit.steps)
     assert fit.solution.objective == by_step["low rank"].objective != by_step["split"].objective
-    assert fit.program.name == "low rank" and fit.solution.solver == solver and set(fit.values) >= {"yhat", "output"}
+    assert fit.problem.name == "low rank" and fit.solution.solver == solver and set(fit.values) >= {"yhat", "output"}
     assert fit.solution.status is Status.LOCAL
     assert fit.solution.objective == pytest.approx(fitted("subspace.nuclear", "admm").solution.objective, rel=1e-6)
     lines = str(fit).partition("Steps\n")[2].splitlines()[1:4]

@@ -35,7 +35,7 @@ def folders(record, tmp_path):
 
 
 def digits(fit):
-    statistics = fit.program.compressed.statistics
+    statistics = fit.problem.compressed.statistics
     return np.concatenate([statistics.gram.ravel(), fit.model.a, fit.model.b[0]])
 
 

@@ -132,7 +132,7 @@ STRUCTURE = {"na": 2, "nb": 2, "basis": "triangular:8"}
 
 def in_record_units(fit):
     """The Gram matrix of a fit with one output in the units of its record; a stream chooses its own by a chunk."""
-    compressed = fit.program.compressed
+    compressed = fit.problem.compressed
     size, level, n = compressed.units.y_scale[0], compressed.units.y_offset[0], compressed.layout.n_columns
     change = np.eye(n + 1)
     for column, sign in [*((i, -1.0) for i in range(compressed.layout.na)), (n, 1.0)]:
@@ -141,7 +141,7 @@ def in_record_units(fit):
 
 
 def assert_same_fit(found, wanted):
-    a, b = found.program.compressed.statistics, wanted.program.compressed.statistics
+    a, b = found.problem.compressed.statistics, wanted.problem.compressed.statistics
     assert (a.rows, a.candidates) == (b.rows, b.candidates)
     left, right = in_record_units(found), in_record_units(wanted)
     norms = np.sqrt(np.diag(right))
@@ -201,7 +201,7 @@ def test_nullable_columns_and_chunks_of_unknown_length(record):
 
 def test_threads_read_parts_to_the_same_digits(record, folders):
     stream = optid.open_stream(folders)
-    layout = optid.fit(record, **STRUCTURE).program.compressed.statistics.layout
+    layout = optid.fit(record, **STRUCTURE).problem.compressed.statistics.layout
     one, several = (collect(stream, layout, threads=count) for count in (1, 3))
     np.testing.assert_array_equal(one.gram, several.gram)
 
@@ -218,7 +218,7 @@ def test_what_is_no_record_in_parts_is_refused(record, folders, tmp_path):
     refuses(DataError, "3 dimensions", optid.open_stream, da.zeros((9, 2, 2)))
     refuses(DataError, "different lengths", optid.open_stream, {"u": da.zeros(9), "y": da.zeros(8)})
     with pytest.raises(DataError, match="weights are for records in memory"):
-        layout = optid.fit(record, **STRUCTURE).program.compressed.statistics.layout
+        layout = optid.fit(record, **STRUCTURE).problem.compressed.statistics.layout
         collect(optid.open_stream(folders), layout, weights=[np.ones(4000), np.ones(2500)])
     text = dd.from_pandas(frame.assign(u="x"), npartitions=2, sort=False)
     refuses(DataError, "partition ., column 'u', row 1 holds 'x'", optid.open_stream(text).ranges)

@@ -11,6 +11,7 @@ import pytest
 from optid import Data, fit
 from optid.backends import Answer, BackEnd, back_ends
 from optid.core.least_squares import RankOneForm
+from optid.core.statement import statement_of
 from optid.errors import StudyError
 from optid.program.solution import Status
 from optid.studies.definition import DataEntry, FormulationEntry, SolverEntry
@@ -303,7 +304,7 @@ def test_a_step_that_was_not_finite_is_no_outcome_of_a_procedure_that_went_on(so
     def run(program, settings):
         steps.append(program.name)
         if len(steps) == 1:
-            nothing = {name: np.full(v.shape, np.nan) for name, v in program.variables.items()}
+            nothing = {name: np.full(v.shape, np.nan) for name, v in statement_of(program).variables.items()}
             return Answer(Status.OPTIMAL, "solved!", nothing)
         return back_ends()["clarabel"].run(program, settings)
 

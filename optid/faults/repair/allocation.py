@@ -174,10 +174,10 @@ class Allocation:
     def _solved(self, posed: "Problem", start: Mapping[str, Array]) -> "Solution":
         """Return the solution of a problem from a start; `StructureError` where there is no point."""
         from optid.backends.choice import find
-        from optid.core.program import as_program
+        from optid.core.statement import for_solvers
         from optid.solving.solve import solve
 
-        program, solver = as_program(posed.beginning(start)), self.solver
+        program, solver = for_solvers(posed.beginning(start)), self.solver
         if isinstance(solver, str) and solver != "auto" and self.route == "nlp" and find(solver).refuses(program):
             solver = "auto"
         solution = solve(program, solver)

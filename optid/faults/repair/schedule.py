@@ -127,7 +127,7 @@ def refit(
     offsets = {c.label: problem.unpack(theta)[f"size[{c.label}]"] for c in problem.offsets}
     model = _plant(problem, theta)
     duals, objective = found.solution.duals, max(found.solution.objective, 1e-300)
-    active = tuple(name for name in found.program.user_constraints
+    active = tuple(name for name in found.problem.constraint_names
                    if np.max(np.abs(duals.get(name, 0.0)), initial=0.0) > 1e-6 * objective)
     least = -(-sum(curve.values_open for curve in curves) // model.l)
     promised = None

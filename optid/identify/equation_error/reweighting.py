@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from optid.core.problem import Problem
-from optid.core.program import Program, as_program
+from optid.core.statement import for_solvers
 from optid.core.terms import Values
 from optid.data.levels import remove_levels
 from optid.data.record import Data
@@ -88,20 +88,20 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Problem], structure:
     whole = compress(data, structure)
     record = data if whole.shifts is None else remove_levels(data)[0]
     used = _Rows(in_units(record, whole.units), whole.layout)
-    problem, base = whole, as_program(pose(whole), step=True)
+    problem, base = whole, for_solvers(replace(pose(whole), step=True))
     scale = base.scale  # the weights of a pass are no unit of the data
 
-    def weighted_program(sizes: list[np.ndarray], start: Values) -> tuple[Program, list[np.ndarray]]:
+    def weighted_program(sizes: list[np.ndarray], start: Values) -> tuple[Problem, list[np.ndarray]]:
         """Return the programme and the weights of a pass, which starts from the solution of the pass before."""
         weights = used.only(_weights(r, kind, width) for r in sizes)
         compressed = replace(compress(data, structure, weights=weights), unweighted=problem.statistics,
                              between=problem.between)
-        return as_program(replace(pose(compressed), scale=scale), step=True).beginning(start), weights
+        return for_solvers(replace(pose(compressed), scale=scale, step=True)).beginning(start), weights
 
     while True:
         if used.count:
             problem = compress(data, structure, weights=used.only(np.ones(e.n_samples) for e in data.experiments))
-            base = as_program(pose(problem), step=True)
+            base = for_solvers(replace(pose(problem), step=True))
             scale = base.scale
         program, weights, spread, width = base, [], 0.0, 0.0
         for _ in range(SETTLING):  # the scale settles before the loss is fixed; afterwards the objective cannot rise
@@ -212,7 +212,7 @@ def _weights(sizes: np.ndarray, kind: str, width: float) -> np.ndarray:
     return width / safe if kind == "huber" else 0.5 / safe
 
 
-def _evidence(program: Program, solution: Solution, sizes: list[np.ndarray], weights: list[np.ndarray],
+def _evidence(program: Problem, solution: Solution, sizes: list[np.ndarray], weights: list[np.ndarray],
               kind: str, width: float, convex: bool) -> Evidence:
     """Objective in the loss itself, and the bound that the weighted residuals of the pass give."""
     pooled, w = np.concatenate(sizes), np.concatenate(weights)
@@ -221,7 +221,7 @@ def _evidence(program: Program, solution: Solution, sizes: list[np.ndarray], wei
     unit = program.unit
     penalty = max(0.0, solution.objective / unit - float(np.sum(w * pooled**2)))
     objective = _loss(pooled, kind, width) + penalty
-    model = program.recover(solution.values)
+    model = program.model(solution.values)
     status = Status.LOCAL if solution.status is Status.OPTIMAL else solution.status
     if not convex:
         bound = Bound.none(f"the exact form with the {kind} loss has no proof")

@@ -1,10 +1,10 @@
 """From the optimum of a descent to a point that a back end confirms: programmes in the tangent of the iterate.
 
-Without constraints one programme at the optimum suffices. With constraints every step is a `Program`, which any back
-end for its class can solve: the linearised errors, the user's constraints in the tangent of the iterate, the curvature
-that earlier steps have shown, and, after a step that our own figures refuse, a quadratic damping term. Whatever the
-constraints, the last programme is that of the linearised errors alone, posed at the final iterate, and solved by the
-back end that was asked for: that it offers no better point is what "locally optimal" means here.
+Without constraints one programme at the optimum suffices. With constraints every step is a convex problem, which any
+back end for its class can solve: the linearised errors, the user's constraints in the tangent of the iterate, the
+curvature that earlier steps have shown, and, after a step that our own figures refuse, a quadratic damping term.
+Whatever the constraints, the last programme is that of the linearised errors alone, posed at the final iterate, and
+solved by the back end that was asked for: that it offers no better point is what "locally optimal" means here.
 """
 
 from collections.abc import Generator, Iterable, Mapping
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.core.program import Program
+from optid.core.problem import Problem
 from optid.errors import RankError, StructureError
 from optid.identify.prediction_error.border import (
     about_poles,
@@ -72,7 +72,7 @@ def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array
     if not np.isfinite(here.at.value):
         raise RankError("no start has a run that stays within its range; use another order or another basis")
     figures = {**figures, "Gauss-Newton steps": found.steps}
-    if here.program.user_constraints:
+    if here.program.constraint_names:
         # how well the record tells the unknowns: a constraint that it contradicts may end where f is all but flat
         figures["condition"] = found.at.condition
         free = fit.criterion.unit * found.value
@@ -145,7 +145,7 @@ def _creeps(fit: TangentFit, end: Evidence) -> bool:
     return known and float(np.abs(poles_of(criterion, fit.places.pack(end.values or {}))).max()) > 1 - 1 / longest
 
 
-def _along_valley(fit: TangentFit, x: Array) -> Generator[Program, Solution, Array]:
+def _along_valley(fit: TangentFit, x: Array) -> Generator[Problem, Solution, Array]:
     """Return x, or a better point along a flat valley: by programmes with the curvature of the errors, measured."""
     first = here = _Iterate.of(fit, x)
     damping = 0.0
@@ -166,7 +166,7 @@ def _along_valley(fit: TangentFit, x: Array) -> Generator[Program, Solution, Arr
 
 
 def _beside_others(fit: TangentFit, x: Array, moved: Iterable[Array | None], figures: Mapping[str, Any]
-                   ) -> Generator[Program, Solution, Array]:
+                   ) -> Generator[Problem, Solution, Array]:
     """Return x, or what is better of moved poles with everything else fitted again under all constraints."""
     best, least = x, fit.criterion.value(x) * (1 - BETTER)
     others = tuple(rule for rule in fit.constraints if "poles" not in getattr(rule, "about", ()))  # those hold as it is
@@ -193,7 +193,7 @@ class _Iterate:
     fit: TangentFit
     x: Array
     at: Linearised
-    program: Program
+    program: Problem
     outside: float  # largest violation, relative
     amount: float  # sum of the absolute violations of the user's constraints
 
@@ -322,7 +322,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) 
             continue
         answered, step = True, here.step(solution)
         gain, new = here.gain(step, at), here.move_to(here.x + step)
-        duals = [solution.duals[name] for name in here.program.user_constraints if name in solution.duals]
+        duals = [solution.duals[name] for name in here.program.constraint_names if name in solution.duals]
         needed = max((2.0 * float(np.max(np.abs(dual), initial=0.0)) for dual in duals), default=0.0)
         weight = max(needed, (weight + needed) / 2)  # multipliers far from the constraints may be huge
         if here.at.value < since * (1 - BETTER):  # little is promised, and more is gained in between
@@ -376,7 +376,7 @@ def _longer(here: _Iterate, new: _Iterate, step: Array, weight: float) -> _Itera
     return new
 
 
-def _shortened(here: _Iterate, weight: float) -> Generator[Program, Solution, _Iterate | None]:
+def _shortened(here: _Iterate, weight: float) -> Generator[Problem, Solution, _Iterate | None]:
     """Take a part of the undamped step: however damped, programmes end on a boundary that may be curved outwards.
 
     A part of the way there is off it, where the point to start from is.

@@ -12,7 +12,6 @@ import numpy as np
 from optid.arrays import Array
 from optid.core.judge import largest_excess
 from optid.core.problem import Problem
-from optid.core.program import Program, as_program
 from optid.core.terms import Squares, Values
 from optid.identify.prediction_error.criterion import Criterion, Places
 from optid.statistics.linearised import Linearised
@@ -48,7 +47,7 @@ class TangentFit:
         """Return the model of the values of the unknowns."""
         return self.problem.model(values)
 
-    def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
+    def pose(self, z0: Array, at: Linearised, damping: float) -> Problem:
         """Return the programme of the step from z0, ``at`` the errors near z0."""
         compressed = self.compressed(at, z0)
         root, target, remainder = compressed.problem
@@ -56,7 +55,7 @@ class TangentFit:
             sizes = np.sqrt(damping) * np.linalg.norm(at.whole[0], axis=0)
             root, target = np.vstack([root, np.diag(sizes)]), np.append(target, sizes * z0)
         squares = Squares(root[:, self.places.columns], target, remainder, tuple(self.places.names))
-        return as_program(self.problem.tangent(self.places.values(z0), squares, compressed), step=True)
+        return self.problem.tangent(self.places.values(z0), squares, compressed)
 
     def excess(self, x: Array, unknowns: frozenset[str] = frozenset()) -> float:
         """Return the largest relative violation of the constraints, or of those about some unknowns alone."""

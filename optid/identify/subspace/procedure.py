@@ -13,8 +13,9 @@ from functools import partial
 from typing import Any
 
 from optid.certificate.hankel import simulation_bound
+from optid.certificate.lifting import certify_rank_one
+from optid.core.least_squares import RankOneForm
 from optid.core.problem import Problem
-from optid.core.program import as_program
 from optid.data.record import Data
 from optid.errors import DataWarning
 from optid.identify.noise import with_noise_or_reason
@@ -73,11 +74,13 @@ class SubspaceSteps:
             a, doubt = shift.a, shift.reason if shift.status is Status.INACCURATE else ""
         step = found.step(a)
         step = replace(step, factored=plan.split == "exact" and any(min(shape) > 1 for shape in step.form.blocks))
-        program = as_program(self.split(step), RELAXED)
+        program = self.split(step)
+        if RankOneForm.of(program) is not None:
+            program = replace(program, proof=lambda problem, x, _: certify_rank_one(problem, x, RELAXED))
         solution: Solution = yield program
         if not solution.has_point:
             return Evidence.pointless(solution.status, solution.reason)
-        model = program.recover(solution.values)
+        model = program.model(solution.values)
         status = Status.LOCAL if solution.status is Status.OPTIMAL else solution.status
         status, reason = (Status.INACCURATE, doubt) if doubt else (status, solution.reason)
         return Evidence(model, solution.objective, partial(_bound, plan, step, solution, program.unit, len(gamma) // l),

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.core.statement import class_of, count_variables
 from optid.errors import DataError, SolverMissing, SolverRefused
 from optid.identify.fitting import Fit, fit
 from optid.program.solution import Solution
@@ -193,7 +194,7 @@ def _loaded(cell: Cell) -> Record:
 
 
 def _verdict(fitted: Fit) -> dict[str, Any]:
-    solution, program = fitted.solution, fitted.program
+    solution, problem = fitted.solution, fitted.problem
     bound, residuals = solution.bound, solution.residuals
     steps = [step for _, step in fitted.steps]
     counts, times = [step.iterations for step in steps], [step.times for step in steps]
@@ -202,7 +203,7 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
         "outcome": DONE, "status_claimed": solution.claimed, "status_verified": str(solution.status),
         "reason": solution.reason, "reached": str(solution.status) in SUCCESS, "proved": solution.proof,
         "false_claim": any(step.false_claim for step in steps), "solver_used": solution.solver,
-        "program_class": program.kind, "unknowns": program.size, "n_programs": len(steps),
+        "program_class": class_of(problem), "unknowns": count_variables(problem), "n_programs": len(steps),
         "steps": as_json(_steps(fitted)),
         "objective": solution.objective, "scale": solution.scale, "bound": bound.value if bound else None,
         "gap": solution.gap, "iterations": sum(counts) if min(counts, default=-1) >= 0 else None,
@@ -236,11 +237,11 @@ def _warm(cell: Cell, fitted: Fit, row: dict[str, Any], limit: float, given: flo
     if left < fitted.solution.times.solve:
         return without_warm(row, f"{max(left, 0.0):.1f} s of the time limit were left, less than the cold one took")
     keep(row)
-    program = fitted.program.beginning(fitted.solution.values)
+    problem = fitted.problem.beginning(fitted.solution.values)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            again: Solution = solve(program, cell.solver_name, accuracy=cell.accuracy, time_limit=limit, isolate=False,
+            again: Solution = solve(problem, cell.solver_name, accuracy=cell.accuracy, time_limit=limit, isolate=False,
                                     prove=False, **cell.solver_options)
     except (Exception, SystemExit) as error:
         return without_warm(row, f"{type(error).__name__}: {error}")

@@ -63,7 +63,7 @@ class Positive(Form):
 
 def run(program: Any, settings: Settings) -> Answer:
     """Solve by the active-set method of SciPy."""
-    problem: Problem = program.core
+    problem: Problem = program
     (squares,) = problem.terms
     low = np.append(np.zeros(problem.size - 1), -np.inf)
     found = lsq_linear(squares.root, squares.target, (low, np.inf), method="bvls", tol=1e-14)

@@ -13,23 +13,24 @@ from cvxpy.reductions.solvers import utilities
 from cvxpy.reductions.solvers.qp_solvers.qp_solver import QpSolver
 
 from optid.backends import Answer, BackEnd, Settings
-from optid.core.program import Program
+from optid.core.problem import Problem
+from optid.core.statement import statement_of
 from optid.program.solution import Status
 
 STATUS = {cp.OPTIMAL: Status.OPTIMAL, cp.USER_LIMIT: Status.LIMIT}
 
 
-def run(program: Program, settings: Settings) -> Answer:
+def run(problem: Problem, settings: Settings) -> Answer:
     """Solve a convex quadratic programme. Option: ``iterations``, 100 unless given."""
+    stated = statement_of(problem)
     options = {"accuracy": settings.accuracy, "iterations": 100, **settings.options}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # optid judges the point
-        program.problem.solve(solver=_Interface(), **options)
-    word = program.problem.status
-    steps = program.problem.solver_stats.num_iters or 0
+        stated.problem.solve(solver=_Interface(), **options)
+    word, steps = stated.problem.status, stated.problem.solver_stats.num_iters or 0
     if word != cp.OPTIMAL:
         return Answer(STATUS.get(word, Status.FAILED), word, iterations=steps)
-    return Answer(Status.OPTIMAL, word, program.values(), program.duals(), steps)
+    return Answer(Status.OPTIMAL, word, stated.values(), stated.duals(), steps)
 
 
 def minimise(P, q, A, b, F, g, accuracy, iterations):

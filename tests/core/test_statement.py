@@ -1,4 +1,4 @@
-"""Program: named parts, further constraints, freezing, values and duals by name."""
+"""Problems and their statements: named parts, further constraints, freezing, values and duals by name."""
 
 
 import cvxpy as cp
@@ -13,7 +13,7 @@ from optid.backends import Answer, BackEnd
 from optid.core.least_squares import RankOneForm
 from optid.core.leaves import Product
 from optid.core.problem import Problem
-from optid.core.program import as_program
+from optid.core.statement import class_of, for_solvers, statement_of
 from optid.core.terms import Squares
 from optid.errors import StructureError
 from optid.program.limits import name_limits
@@ -33,7 +33,7 @@ def bilinear(*builders):
 
 def test_class_of_every_case_is_what_its_name_says():
     for name, entry in CASES.items():
-        kind = as_program(entry.build()).kind
+        kind = class_of(for_solvers(entry.build()))
         expected = {"lp": {"LP"}, "qp": {"QP"}, "socp": {"SOCP"}, "sdp": {"SDP"}, "exp": {"conic"}, "nlp": {"NLP"},
                     "rank": {"NLP"}, "nuclear": {"SDP"}, "group": {"SOCP"}}[name.split("_")[0]]
         assert kind in expected, name
@@ -46,15 +46,15 @@ def test_class_of_every_case_is_what_its_name_says():
 ])
 def test_class_by_atom(atom, kind):
     x = cp.Variable((2, 2), name="x", symmetric=True)
-    assert pose("class", atom(x), {"fixed": x[0, 1] == 1}, [x]).kind == kind
+    assert class_of(pose("class", atom(x), {"fixed": x[0, 1] == 1}, [x])) == kind
 
 
 def test_what_is_neither_convex_nor_smooth_is_named():
     x = cp.Variable(2, name="x")
     program = pose("rough", x[0] * x[1], {"cap": cp.max(x) <= 1, "gap": cp.max(x) >= 0.5}, [x])
     with pytest.raises(StructureError, match="constraint 'gap'"):
-        _ = program.kind
-    assert program.nonconvex_parts() == ["the objective", "constraint 'gap'"]
+        _ = class_of(program)
+    assert statement_of(program).nonconvex_parts() == ["the objective", "constraint 'gap'"]
 
 
 # subject_to
@@ -89,7 +89,7 @@ def test_foreign_variable_is_named():
 def test_names_are_used_once():
     problem, _ = bilinear(lambda v: {"sign": v["b"][0] >= 0}, lambda v: {"sign": v["mu"] >= 0})
     refuses(StructureError, "two constraints named 'sign'", problem.constraints)
-    refuses(StructureError, "two constraints named 'gauge'", as_program,
+    refuses(StructureError, "two constraints named 'gauge'", for_solvers,
             bilinear(lambda v: {"gauge": v["b"][0] >= 0})[0])
 
 
@@ -112,7 +112,7 @@ def test_a_bilinear_problem_with_one_factor_held_is_least_squares():
     problem, target = bilinear()
     for b in ([0.6, 0.8], [0.8, -0.6]):
         held = problem.holding({**problem.start, "b": np.array(b)}, ["b"])
-        assert as_program(problem).kind == "NLP" and as_program(held).kind == "QP" and set(held.start) == {"mu"}
+        assert class_of(problem) == "NLP" and class_of(held) == "QP" and set(held.start) == {"mu"}
         found = solve(held, "clarabel")
         assert found.values["mu"] == pytest.approx(target @ b, abs=1e-6)
         assert held.model(found.values)["b"] == pytest.approx(b)
@@ -136,18 +136,18 @@ def test_holding_what_is_not_there_or_of_another_shape():
 
 
 def test_duals_are_flat_and_by_name():
-    program = as_program(case("qp_repeated_constraints").build())
+    program = for_solvers(case("qp_repeated_constraints").build())
     found = solve(program, "clarabel")
     assert {name: d.shape for name, d in found.duals.items()} == {"once": (1,), "twice": (1,), "cap": (2,)}
-    program.clear_duals()
-    assert program.duals() == {}
+    statement_of(program).begin(program.start)
+    assert statement_of(program).duals() == {}
 
 
 def test_point_outside_the_bounds_of_a_variable_can_be_assigned_and_judged():
     x = cp.Variable(2, name="x", nonneg=True)
     program = pose("bounded", cp.sum(x), {}, [x])
-    program.assign({"x": np.array([-1e-9, 0.0])})
-    assert program.values()["x"][0] == -1e-9
+    statement_of(program).assign({"x": np.array([-1e-9, 0.0])})
+    assert statement_of(program).values()["x"][0] == -1e-9
 
 
 def test_view_of_several_inputs_asks_for_the_channel():
@@ -167,4 +167,4 @@ def test_a_lie_about_a_programme_that_is_not_stated_is_found_out(change, status)
     values = {**found.solution.values, **change(found.solution.values)}
     liar = BackEnd("liar", frozenset(), lambda program, settings: Answer(Status.OPTIMAL, "trust me", values),
                    form="rank-one", takes=RankOneForm.of)
-    assert solve(found.program, liar).status is status
+    assert solve(found.problem, liar).status is status
