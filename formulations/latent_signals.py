@@ -121,7 +121,7 @@ def _problem(name: str, errors: StateErrors, x: np.ndarray, constraints: Sequenc
     return Problem(
         name,
         start=variables.values(x),
-        terms=(Errors(variables.squares, variables.value),),
+        terms=(Errors(variables.squares, variables.value, errors),),
         leaves=factors(errors), further=partial(_signals, errors), about=frozenset({"P", "Q"}),
         model=partial(errors.model, constrained=bool(constraints)),
         facts={**facts, "iterate": True, "bases": facts["bases"] | {z: one.basis for z, one in latent.items()},

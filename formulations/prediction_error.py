@@ -154,7 +154,7 @@ def _problem(name: str, errors: TransferErrors, optimum: Array) -> Problem:
     return Problem(
         name,
         start=variables.values(optimum),
-        terms=(Errors(variables.squares, variables.value),),
+        terms=(Errors(variables.squares, variables.value, errors),),
         leaves=tuple(Product(errors.key("mu", c), errors.key("b", c), errors.gauge)
                      for c, free in enumerate(errors.unknowns.free) if free),
         further=partial(_signals, errors), model=errors.model, facts={"iterate": True, **errors.facts()},

@@ -88,7 +88,7 @@ def _problem(errors: ProcessErrors, x: Array) -> Problem:
     return Problem(
         "process.exact",
         start=places.values(x),
-        terms=(Errors(places.squares, places.value),),
+        terms=(Errors(places.squares, places.value, errors),),
         further=partial(_signals, errors), model=errors.model,
         facts={"iterate": True, "channels": data.inputs, "outputs": data.outputs,
                "bases": dict(zip(data.inputs, errors.outer_bases))},

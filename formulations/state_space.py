@@ -117,7 +117,7 @@ def _problem(name: str, errors: StateErrors, x: np.ndarray, constraints: Sequenc
     return Problem(
         name,
         start=variables.values(x),
-        terms=(Errors(variables.squares, variables.value),),
+        terms=(Errors(variables.squares, variables.value, errors),),
         leaves=leaves, further=partial(signals, errors), about=frozenset({"P", "Q"}),
         model=partial(errors.model, constrained=bool(constraints)), facts={"iterate": True, **errors.facts()},
         builders=tuple(constraints), **errors.common())

@@ -232,10 +232,13 @@ class Errors:
     Attributes:
         linearise: values of the unknowns -> the `Squares` of the errors to first order in them.
         measure: values of the unknowns -> sum of squares, infinite where the run is not admissible.
+        criterion: what the errors are of, for methods that take steps with them; see
+            `optid.identify.prediction_error.criterion`.
     """
 
     linearise: Callable[[Values], Squares]
     measure: Callable[[Values], float]
+    criterion: Any = field(default=None, repr=False)
 
     def value(self, y: Values) -> float:
         """Return the value at values of the leaves."""

@@ -1,7 +1,6 @@
 """Steps of problems whose errors are nonlinear: leaves, errors and constraints to first order about a point."""
 
 from dataclasses import replace
-from functools import partial
 
 import cvxpy as cp
 import numpy as np
@@ -14,9 +13,8 @@ from optid.backends.conic import solve_with
 from optid.core.leaves import Affine, Product, Quantity
 from optid.core.statement import class_of, for_solvers, is_stated, statement_of
 from optid.errors import StructureError
-from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.static_curve import static_curve
-from optid.identify.prediction_error.tangent_fit import TangentFit
+from optid.identify.prediction_error.tangent_problem import criterion_of, step_problem
 from optid.identify.prediction_error.transfer_errors import TransferOrders, transfer_errors
 from optid.program.solution import Status
 
@@ -38,7 +36,7 @@ def fit_of(seed, *builders, gauge="norm"):
     rng = np.random.default_rng(seed)
     x = errors.normalise(np.concatenate([[-1.1, 0.3], rng.uniform(0.5, 1.5, errors.unknowns.size - 2)]))
     problem = transfer_problem("a test", errors, x).subject_to(*builders)
-    return TangentFit(problem, errors, partial(CompressedErrors, errors)), x
+    return problem, x
 
 
 def moved(x, name, k, step):
@@ -92,15 +90,15 @@ def test_a_leaf_to_first_order_touches_the_leaf(seed):
 @pytest.mark.parametrize("gauge", ["norm", "gain", "b0"])
 def test_the_tangent_has_the_value_and_the_gradient_of_the_errors(seed, gauge):
     fit, z0 = fit_of(seed, gauge=gauge)
-    x, problem = fit.places.values(z0), fit.problem
-    step = problem.tangent(x, fit.places.squares(x), None)
+    x, problem = criterion_of(fit).variables.values(z0), fit
+    step = problem.tangent(x, criterion_of(fit).variables.squares(x), None)
     value, gradient, _ = problem.pull(x)
     there, slope, _ = step.pull(x)
-    assert value == pytest.approx(fit.criterion.value(z0), rel=1e-9) and there == pytest.approx(value, rel=1e-9)
+    assert value == pytest.approx(criterion_of(fit).value(z0), rel=1e-9) and there == pytest.approx(value, rel=1e-9)
     np.testing.assert_allclose(slope, gradient, rtol=1e-8, atol=1e-8 * np.abs(gradient).max())
     for k, name in enumerate(np.repeat(list(x), [np.size(one) for one in x.values()])):
         place = problem.slices[name].start
-        up, down = (fit.places.value(moved(x, name, k - place, sign * 1e-6)) for sign in (1, -1))
+        up, down = (criterion_of(fit).variables.value(moved(x, name, k - place, sign * 1e-6)) for sign in (1, -1))
         assert gradient[k] == pytest.approx((up - down) / 2e-6, rel=1e-3, abs=1e-3 * np.abs(gradient).max())
 
 
@@ -117,8 +115,8 @@ def test_rows_are_read_once_and_what_looks_at_the_iterate_at_every_one():
 
     fit, z0 = fit_of(0, still, moving)
     for size in (1.0, 1.1, 1.2):
-        x = {**fit.places.values(z0), "mu": size * fit.places.values(z0)["mu"]}
-        step = fit.problem.tangent(x, fit.places.squares(x), None)
+        x = {**criterion_of(fit).variables.values(z0), "mu": size * criterion_of(fit).variables.values(z0)["mu"]}
+        step = fit.tangent(x, criterion_of(fit).variables.squares(x), None)
         (bound,) = (one for one in step.constraints(x) if one.name == "moving")
         assert bound.right[0] * bound.sizes[0] == pytest.approx(2 * abs(x["mu"][0]))
         assert not any(one.moving for one in step.constraints())
@@ -131,15 +129,15 @@ def test_rows_are_read_once_and_what_looks_at_the_iterate_at_every_one():
 def test_a_step_in_rows_is_that_of_the_programme_in_cvxpy(seed, damping):
     fit, z0 = fit_of(seed, lambda v: {"large": v["Theta"] <= 0.4},
                      lambda v: {"gain": cp.sum(v["Theta"]) == 1.0 + cp.sum(v["a"])})
-    at = fit.criterion.linearise(z0)
-    program = fit.pose(z0, at, damping)
+    at = criterion_of(fit).linearise(z0)
+    program = step_problem(fit, z0, at, damping)
     assert not is_stated(program) and class_of(program) == "QP"
     rows = solve_with("clarabel", program, Settings(1e-10))
     assert not is_stated(program)
-    stated = fit.pose(z0, at, damping)
+    stated = step_problem(fit, z0, at, damping)
     whole = solve_with("clarabel", stated, Settings(1e-10, options={"max_iter": 400}))
     assert is_stated(stated) and rows.status == whole.status
-    for name in fit.places.names:
+    for name in criterion_of(fit).variables.names:
         np.testing.assert_allclose(rows.values[name], whole.values[name], rtol=1e-4, atol=1e-5)
     for name in ("large", "gain"):
         np.testing.assert_allclose(rows.duals[name], whole.duals[name], rtol=1e-3,
@@ -160,11 +158,11 @@ def test_a_name_of_the_formulation_is_taken():
 
 def test_a_quantity_of_the_unknowns_is_a_leaf_like_any_other():
     fit, z0 = fit_of(1)
-    x = fit.places.values(z0)
+    x = criterion_of(fit).variables.values(z0)
     size = Quantity("size", lambda y: np.array([y["mu"] @ y["mu"]]), lambda y: {"mu": 2 * y["mu"][None]})
-    problem = fit.problem.subject_to(lambda v: {"small": v["size"] <= 0.5})
+    problem = fit.subject_to(lambda v: {"small": v["size"] <= 0.5})
     problem = replace(problem, leaves=(*problem.leaves, size), facts={**problem.facts, "units": None})
-    step = problem.tangent(x, fit.places.squares(x), None)
+    step = problem.tangent(x, criterion_of(fit).variables.squares(x), None)
     found = solve_with("clarabel", for_solvers(step), Settings(1e-10)).values
     change = float(2 * x["mu"] @ (found["mu"] - x["mu"]) + x["mu"] @ x["mu"])
     assert change <= 0.5 + 1e-7
@@ -177,19 +175,19 @@ def test_a_step_under_a_matrix_is_that_of_the_programme_in_cvxpy(seed):
         return {"definite": cp.bmat([[1.0, a[0] / 2 + 0.3, 0.1], [a[0] / 2 + 0.3, 0.5, a[1]], [0.1, a[1], 0.4]]) >> 0}
 
     fit, z0 = fit_of(seed, definite, lambda v: {"large": v["Theta"] <= 0.4})
-    at = fit.criterion.linearise(z0)
-    program, stated = fit.pose(z0, at, 0.0), fit.pose(z0, at, 0.0)
+    at = criterion_of(fit).linearise(z0)
+    program, stated = step_problem(fit, z0, at, 0.0), step_problem(fit, z0, at, 0.0)
     assert class_of(program) == "SDP" == class_of(stated)
     rows = solve_with("clarabel", program, Settings(1e-10))
     assert not is_stated(program) and rows.status == Status.OPTIMAL
     whole = solve_with("clarabel", stated, Settings(1e-10, options={"max_iter": 400}))
     assert is_stated(stated) and class_of(stated) == "SDP"
-    for name in fit.places.names:
+    for name in criterion_of(fit).variables.names:
         np.testing.assert_allclose(rows.values[name], whole.values[name], rtol=1e-3, atol=1e-4)
     for name in ("large", "definite"):
         np.testing.assert_allclose(rows.duals[name], whole.duals[name], rtol=1e-2,
                                    atol=1e-3 * np.abs(whole.duals[name]).max())
     dual, matrix = rows.duals["definite"].reshape(3, 3), statement_of(stated).constraints["definite"][0].args[0]
-    statement_of(stated).assign({name: rows.values[name] for name in fit.places.names})
+    statement_of(stated).assign({name: rows.values[name] for name in criterion_of(fit).variables.names})
     assert np.linalg.eigvalsh(dual)[0] > -1e-6 * np.abs(dual).max()
     assert abs(np.sum(dual * matrix.value)) < 1e-5 * np.abs(dual).max()

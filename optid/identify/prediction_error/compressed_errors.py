@@ -8,7 +8,7 @@ gives the sandwich form of the covariance (Ljung, System Identification, 1999, c
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from optid.core.terms import Values
 from optid.data.channels import Transform
 from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.prediction_error.error_noise import ErrorNoise
-from optid.identify.prediction_error.state_errors import StateErrors
 from optid.program.compressed import Spread, degrees_of_freedom, white_spread
 from optid.program.units import energy_unit
 from optid.statistics.coloured import score_covariance
@@ -158,7 +157,7 @@ class CompressedErrors:
 class CompressedStates(CompressedErrors):
     """The compressed errors of a state-space model; see `CompressedErrors`."""
 
-    criterion: StateErrors
+    criterion: Any  # `optid.identify.prediction_error.state_errors.StateErrors`
     fixed: bool = False  # whether the programme fixes by rows what changes no output
 
     @property

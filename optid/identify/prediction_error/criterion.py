@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.core.terms import Squares, Values, flat
+from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.statistics.linearised import Linearised, Method
 from optid.statistics.unknowns import Unknowns
@@ -82,6 +83,7 @@ class Criterion(ABC):
     unknowns: Unknowns  # the order of x
     gauge: str  # how the scale between mu and b is fixed
     weight: Array  # (l, l) weight of the errors
+    units: Transform  # from those of the models of points to those of the record
     unit: float = 1.0  # what one unit of the sum of squares is in units of the record
     # whether the errors are nonlinear in the initial states, so that steps of these are damped, too
     bends: bool = False
@@ -133,6 +135,10 @@ class Criterion(ABC):
         y = np.vstack(outputs)
         y = np.nan_to_num(y - np.nanmean(y, axis=0))
         return float(np.sum((y @ self.weight) * y))
+
+    def compressed_near(self, at: Linearised, x: Array) -> Any:
+        """Return the compressed errors near x (`optid.program.compressed`), ``at`` the errors there."""
+        raise NotImplementedError(f"no steps are taken with {type(self).__name__}")
 
     @abstractmethod
     def key(self, name: str, number: int) -> str:

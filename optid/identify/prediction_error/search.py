@@ -16,11 +16,13 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.bases import Linear, fitted_bases
+from optid.core.problem import Problem
 from optid.data.record import Data
 from optid.data.stretches import interpolate_missing
 from optid.errors import DataWarning, OptidError, RankError
 from optid.identify.prediction_error.descent import Descent, agreement, best_of, descend, with_poles
-from optid.identify.prediction_error.tangent_fit import TangentFit
+from optid.identify.prediction_error.signs import with_required_signs
+from optid.identify.prediction_error.tangent_problem import excess
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.identify.subspace.projection import project, realise
 from optid.models.layout import Layout
@@ -95,26 +97,26 @@ def _complete(data: Data) -> float:
     return float(np.mean(np.concatenate([np.isfinite(record).all(axis=1) for record in data.records])))
 
 
-def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) -> Array:
+def entry(fit: Problem, criterion: TransferErrors, found: Sequence[Descent]) -> Array:
     """Return the start under the constraints: the best of the optima with their poles moved into the region.
 
     The other unknowns are fitted again; without constraints on the poles alone they stay. Where a pole must lie at 1,
     the nearest one is moved there.
     """
-    if not fit.constraints:
-        return fit.with_required_signs(found[0].x)
+    if not fit.builders:
+        return with_required_signs(fit, found[0].x)
     at, ends = criterion.unknowns.slices["a"], []
     for one in found[:ENTRIES]:
-        x = fit.with_required_signs(one.x)
+        x = with_required_signs(fit, one.x)
         first = with_integrator if criterion.integrates and criterion.unknowns.layout.na else np.array
         moves: list[Callable[[Array], Array]] = [first, *(partial(contain_roots, limit=radius) for radius in PULLS)]
         for move in moves:
             pulled = move(x[at])
-            if fit.excess(np.concatenate([pulled, x[at.stop :]]), frozenset({"a"})) <= 1e-9:
+            if excess(fit, np.concatenate([pulled, x[at.stop :]]), frozenset({"a"})) <= 1e-9:
                 again = one if np.array_equal(pulled, x[at]) else with_poles(criterion, x, pulled)
                 ends.append((again.value, again.x))
                 break
-    return fit.with_required_signs(min(ends, key=lambda end: end[0])[1] if ends else found[0].x)
+    return with_required_signs(fit, min(ends, key=lambda end: end[0])[1] if ends else found[0].x)
 
 
 def starts_of(criterion: TransferErrors, number: int, seed: int) -> Iterable[tuple[str, Array]]:

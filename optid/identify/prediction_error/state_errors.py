@@ -19,6 +19,7 @@ from optid.bases import Basis, Linear
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
+from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.subspace.realisation import state_model
 from optid.models import HammersteinSS, Nonlinearity
@@ -86,6 +87,10 @@ class StateErrors(Criterion):
         if unknowns.innovations or not (unknowns.expansion.feedback or unknowns.latent):
             return None
         return tuple(simulation.allowed_range([e.y], WILD) for e in self.data.experiments)
+
+    def compressed_near(self, at: Linearised, x: Array) -> CompressedStates:
+        """Return the compressed errors near x, ``at`` the errors there."""
+        return CompressedStates(self, at, x)
 
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x; of infinite value where a run leaves the range allowed."""

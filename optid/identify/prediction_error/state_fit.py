@@ -14,13 +14,12 @@ from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
 from optid.identify.arguments import check_offset, in_memory
-from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.latent_search import STAGES, first_samples
+from optid.identify.prediction_error.signs import with_required_signs
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.state_search import complete, errors_and_starts, on_whole, quietly, search_states
 from optid.identify.prediction_error.tangent_descent import refine
-from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.subspace.plan import Plan, in_record_units, make_plan
 from optid.identify.subspace.procedure import SubspaceSteps
 from optid.models import HammersteinSS
@@ -118,8 +117,7 @@ def fit_states(name: str, data: Data, *, pose: Pose, subspace: SubspaceSteps, ex
 def _refined(pose: Pose, plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: Descent,
              figures: Mapping[str, Any]) -> Procedure:
     problem = pose(plan.name, errors, best.x, constraints)
-    fit = TangentFit(problem, errors, partial(CompressedStates, errors))
-    return (yield from refine(fit, best, figures, fit.with_required_signs(best.x)))
+    return (yield from refine(problem, best, figures, with_required_signs(problem, best.x)))
 
 
 def _block_rows(plan: Plan) -> list[int | None]:

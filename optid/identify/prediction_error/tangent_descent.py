@@ -24,9 +24,11 @@ from optid.identify.prediction_error.border import (
     with_double_pole,
     with_slow_poles,
 )
+from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.prediction_error.curvature import Curvature, measure_curvature
 from optid.identify.prediction_error.descent import STEPS, Descent
-from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
+from optid.identify.prediction_error.signs import input_signs, sign_variants
+from optid.identify.prediction_error.tangent_problem import INSIDE, criterion_of, excess, step_problem, under
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
 from optid.statistics.linearised import CONDITION_LIMIT, Linearised
@@ -56,11 +58,11 @@ CREEPS = ("the errors still fall as a pole nears the unit circle, where a static
 NO_BOUND = "the {} are not convex in poles and zeros: no lower bound is known, several starts are compared"
 
 
-def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array) -> Procedure:
+def refine(problem: Problem, found: Descent, figures: Mapping[str, Any], x: Array) -> Procedure:
     """Bring a descent to a point that a back end confirms, under the constraints of the programmes.
 
     Args:
-        fit: its programmes.
+        problem: of the fit; its term is `optid.core.terms.Errors`.
         found: the unconstrained optimum.
         figures: what is known already; returned with the evidence.
         x: where to start: the optimum, in the signs that the constraints ask for, or a point nearer to them.
@@ -68,91 +70,93 @@ def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array
     Returns:
         The evidence, or None where a programme has no point: its status says why.
     """
-    here = _Iterate.of(fit, x)
+    here = _Iterate.of(problem, x)
     if not np.isfinite(here.at.value):
         raise RankError("no start has a run that stays within its range; use another order or another basis")
     figures = {**figures, "Gauss-Newton steps": found.steps}
-    if here.program.constraint_names:
+    if here.tangent.constraint_names:
         # how well the record tells the unknowns: a constraint that it contradicts may end where f is all but flat
         figures["condition"] = found.at.condition
-        free = fit.criterion.unit * found.value
+        free = criterion_of(problem).unit * found.value
         best = yield from _best_signed(here, free, figures)
         if best is None:
             return None
         easy = best.objective <= free * (1 + CONFLICT) and found.at.condition < CONDITION_LIMIT
-        end = yield from _settled(fit, best, figures, easy)
-        return replace(end, reason=CREEPS) if end.status is Status.LIMIT and _creeps(fit, end) else end
-    solution = yield here.program
+        end = yield from _settled(problem, best, figures, easy)
+        return replace(end, reason=CREEPS) if end.status is Status.LIMIT and _creeps(problem, end) else end
+    solution = yield here.tangent
     if not solution.has_point:
         return None
     verdict = here.judge(solution, CONFIRMED) if found.converged else (Status.LIMIT, found.reason)
     return here.evidence(*verdict, {**figures, "programmes": 1})
 
 
-def _settled(fit: TangentFit, end: Evidence, figures: Mapping[str, Any], easy: bool) -> Procedure:
+def _settled(problem: Problem, end: Evidence, figures: Mapping[str, Any], easy: bool) -> Procedure:
     """Go on from an end while another way lowers the errors: along flat valleys, or with poles along their border.
 
     An easy end is near the free optimum, where the record tells all unknowns: only poles on a border make it flat.
     Where two poles all but meet there, programmes have no answer any more; the errors as a function of these two, with
     everything else fitted, then say that a point is the best one near it, if nothing else is constrained.
     """
-    depth, tried = about_poles(fit.constraints), False
-    alone = all("poles" in getattr(rule, "about", ()) for rule in fit.constraints)
+    criterion = criterion_of(problem)
+    depth, tried = about_poles(problem.builders), False
+    alone = all("poles" in getattr(rule, "about", ()) for rule in problem.builders)
     for _ in range(ROUNDS):
         if end.status not in (Status.LOCAL, Status.LIMIT, Status.INACCURATE):
             break
-        best = before = fit.places.pack(end.values or {})
+        best = before = criterion.variables.pack(end.values or {})
         if depth is not None:
-            best = along_border(fit.criterion, depth, before, ALONG, alone)
+            best = along_border(criterion, depth, before, ALONG, alone)
             if not alone:
-                best = yield from _beside_others(fit, before, (with_double_pole(fit.criterion, depth, before), best),
-                                                 figures)
+                moved = with_double_pole(criterion, depth, before), best
+                best = yield from _beside_others(problem, before, moved, figures)
                 tried = True
         on_border = best is not before
         if not on_border and end.status is Status.LOCAL and not (easy and depth is None):
-            best, tried = (yield from _along_valley(fit, before)), True
+            best, tried = (yield from _along_valley(problem, before)), True
         if best is before and (end.status is Status.LOCAL or depth is None):
             break
-        there, tried = _Iterate.of(fit, best), True
+        there, tried = _Iterate.of(problem, best), True
         again = yield from _constrained(there, figures, MOVED)
-        least = min(end.objective, fit.criterion.unit * there.at.value)
-        if _is_inside(fit, again) and (
+        least = min(end.objective, criterion.unit * there.at.value)
+        if _is_inside(problem, again) and (
                 again.status is Status.LOCAL and again.objective < end.objective
                 or again.objective < least * (1 - WORTH)):
             end = again  # on the way, if not there
             continue
-        two = alone and depth is not None and meet(fit.criterion, best)
-        two = two and (yield from _along_valley(fit, best)) is best
-        gains = fit.criterion.unit * there.at.value < end.objective * (1 - BETTER)
+        two = alone and depth is not None and meet(criterion, best)
+        two = two and (yield from _along_valley(problem, best)) is best
+        gains = criterion.unit * there.at.value < end.objective * (1 - BETTER)
         if end.status is Status.LOCAL and not gains and not two:
             break
-        status = (Status.LOCAL, NO_BOUND.format(fit.criterion.errors)) if two else (
+        status = (Status.LOCAL, NO_BOUND.format(criterion.errors)) if two else (
             Status.LIMIT, MEETING if on_border or end.status is not Status.LOCAL else IN_VALLEY)
         end = there.evidence(*status, end.figures)
         break
     else:
         end = replace(end, status=Status.LIMIT, reason=f"{IN_VALLEY}, or a border, after {ROUNDS} moves")
     if tried:  # prices are those of the last programme
-        yield _end_of(fit, end).program
+        yield _end_of(problem, end).tangent
     return end
 
 
-def _creeps(fit: TangentFit, end: Evidence) -> bool:
+def _creeps(problem: Problem, end: Evidence) -> bool:
     """Whether the slowest pole of an end that has not arrived acts longer than an experiment."""
-    criterion = fit.criterion
+    criterion = criterion_of(problem)
     longest = max(e.n_samples for e in criterion.data.experiments)
     known = criterion.dynamics in criterion.unknowns.slices
-    return known and float(np.abs(poles_of(criterion, fit.places.pack(end.values or {}))).max()) > 1 - 1 / longest
+    poles = poles_of(criterion, criterion.variables.pack(end.values or {})) if known else np.zeros(1)
+    return float(np.abs(poles).max()) > 1 - 1 / longest
 
 
-def _along_valley(fit: TangentFit, x: Array) -> Generator[Problem, Solution, Array]:
+def _along_valley(problem: Problem, x: Array) -> Generator[Problem, Solution, Array]:
     """Return x, or a better point along a flat valley: by programmes with the curvature of the errors, measured."""
-    first = here = _Iterate.of(fit, x)
+    first = here = _Iterate.of(problem, x)
     damping = 0.0
     for _ in range(ALL):
-        at, new = measure_curvature(fit.criterion, here.x, here.at), None
+        at, new = measure_curvature(criterion_of(problem), here.x, here.at), None
         while new is None and damping <= 1.0:
-            solution = yield fit.pose(here.x, at, damping)
+            solution = yield step_problem(problem, here.x, at, damping)
             if solution.has_point:
                 gain, new = here.gain(step := here.step(solution), at), here.move_to(here.x + step)
                 damping = damping if gain > ALONG * here.at.value else np.inf
@@ -165,52 +169,59 @@ def _along_valley(fit: TangentFit, x: Array) -> Generator[Problem, Solution, Arr
     return here.x if here.at.value < first.at.value * (1 - BETTER) else x
 
 
-def _beside_others(fit: TangentFit, x: Array, moved: Iterable[Array | None], figures: Mapping[str, Any]
+def _beside_others(problem: Problem, x: Array, moved: Iterable[Array | None], figures: Mapping[str, Any]
                    ) -> Generator[Problem, Solution, Array]:
     """Return x, or what is better of moved poles with everything else fitted again under all constraints."""
-    best, least = x, fit.criterion.value(x) * (1 - BETTER)
-    others = tuple(rule for rule in fit.constraints if "poles" not in getattr(rule, "about", ()))  # those hold as it is
+    best, least = x, criterion_of(problem).value(x) * (1 - BETTER)
+    # those about poles hold as it is
+    others = tuple(rule for rule in problem.builders if "poles" not in getattr(rule, "about", ()))
     for point in moved:
         if point is None or point is x:
             continue
-        end = yield from _with_poles(fit, point, others, figures)
-        there = None if end is None else _end_of(fit, end)
+        end = yield from _with_poles(problem, point, others, figures)
+        there = None if end is None else _end_of(problem, end)
         if there is not None and there.outside <= INSIDE and there.at.value < least:
             best, least = there.x, there.at.value
     return best
 
 
-def _with_poles(fit: TangentFit, x: Array, rules: tuple[Any, ...], figures: Mapping[str, Any]) -> Procedure:
+def _with_poles(problem: Problem, x: Array, rules: tuple[Any, ...], figures: Mapping[str, Any]) -> Procedure:
     """Fit everything but the poles of x again, under rules."""
-    word = fit.criterion.dynamics
-    part = fit.criterion.unknowns.parts(x)[word]
-    still = fit.under(rules, lambda view: {"poles": view[word] == part})
+    criterion = criterion_of(problem)
+    word, part = criterion.dynamics, criterion.unknowns.parts(x)[criterion.dynamics]
+    still = under(problem, rules, lambda view: {"poles": view[word] == part})
     return (yield from _constrained(_Iterate.of(still, x), figures, MOVED))
 
 
 @dataclass(frozen=True, eq=False)
 class _Iterate:
-    fit: TangentFit
+    problem: Problem
     x: Array
     at: Linearised
-    program: Problem
+    tangent: Problem  # that of the step from here
     outside: float  # largest violation, relative
     amount: float  # sum of the absolute violations of the user's constraints
 
+    @property
+    def criterion(self) -> Criterion:
+        """The errors."""
+        return criterion_of(self.problem)
+
     @classmethod
-    def of(cls, fit: TangentFit, x: Array) -> "_Iterate":
-        x = fit.criterion.normalise(x)
-        at = fit.criterion.linearise(x)
-        outside = fit.excess(x) if fit.constraints else 0.0
-        amount = fit.problem.violation(fit.places.values(x)) if outside > NOWHERE else 0.0
-        return cls(fit, x, at, fit.pose(x, at, 0.0), outside, amount)
+    def of(cls, problem: Problem, x: Array) -> "_Iterate":
+        criterion = criterion_of(problem)
+        x = criterion.normalise(x)
+        at = criterion.linearise(x)
+        outside = excess(problem, x) if problem.builders else 0.0
+        amount = problem.violation(criterion.variables.values(x)) if outside > NOWHERE else 0.0
+        return cls(problem, x, at, step_problem(problem, x, at, 0.0), outside, amount)
 
     def move_to(self, x: Array) -> "_Iterate | None":
         """Return the iterate at x, None where it is inadmissible, its run explodes or its gauge cannot be reached."""
-        criterion = self.fit.criterion
+        criterion = self.criterion
         x = criterion.confine(x)
         try:
-            return _Iterate.of(self.fit, x) if criterion.admissible(x) and np.isfinite(criterion.value(x)) else None
+            return _Iterate.of(self.problem, x) if criterion.admissible(x) and np.isfinite(criterion.value(x)) else None
         except StructureError:
             return None
 
@@ -218,7 +229,7 @@ class _Iterate:
         return self.at.value + weight * self.amount
 
     def step(self, solution: Solution) -> Array:
-        return self.fit.places.pack(solution.values) - self.x
+        return self.criterion.variables.pack(solution.values) - self.x
 
     def gain(self, step: Array, at: Linearised | None = None) -> float:
         """By how much a step lowers the sum of squares of the linear errors, or of others with the same gradient."""
@@ -226,7 +237,7 @@ class _Iterate:
         return at.value - at.after(step)
 
     def negligible(self, gain: float, share: float) -> bool:
-        return abs(gain) <= share * self.at.value + ROUNDING * self.fit.criterion.energy
+        return abs(gain) <= share * self.at.value + ROUNDING * self.criterion.energy
 
     def judge(self, solution: Solution, share: float) -> tuple[Status, str]:
         """What an answer to the programme makes of the iterate: it must have been solved, and the iterate stay."""
@@ -234,14 +245,14 @@ class _Iterate:
             return solution.status, solution.reason
         gain = self.gain(self.step(solution))
         if self.negligible(gain, share):
-            return Status.LOCAL, NO_BOUND.format(self.fit.criterion.errors)
+            return Status.LOCAL, NO_BOUND.format(self.criterion.errors)
         return Status.INACCURATE, (f"{solution.solver} moves the sum of squares of the last tangent programme by "
                                    f"{abs(gain) / max(self.at.value, 1e-300):.0e} of its value")
 
     def evidence(self, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
-        bound = Bound.none(NO_BOUND.format(self.fit.criterion.errors))
-        values, value = self.fit.places.values(self.x), self.fit.criterion.unit * self.at.value
-        model, turns = self.fit.recover(values), self.fit.turns(self.x) if self.fit.constraints else np.ones(1)
+        bound = Bound.none(NO_BOUND.format(self.criterion.errors))
+        values, value = self.criterion.variables.values(self.x), self.criterion.unit * self.at.value
+        model, turns = self.problem.model(values), input_signs(self.problem, self.x)
         model = model.with_signs(turns) if np.any(turns < 0) else model
         return Evidence(model, value, bound, status, reason, figures, values=values)
 
@@ -252,35 +263,35 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
     Constraints that the record contradicts have several local optima; near the free optimum there is one. A slow pole
     is another way to the characteristic that they ask for, and so are the poles of the free optimum, held at first.
     """
-    fit = here.fit
+    problem, criterion = here.problem, here.criterion
     best = yield from _constrained(here, figures)
     if best is not None and best.objective <= free * (1 + CONFLICT):
         return best
-    known = about_poles(fit.constraints) or fit.criterion.dynamics not in fit.criterion.unknowns.slices
-    slow = [] if known else with_slow_poles(fit.criterion, here.x)
+    known = about_poles(problem.builders) or criterion.dynamics not in criterion.unknowns.slices
+    slow = [] if known else with_slow_poles(criterion, here.x)
     held = []
     for x in () if known else (here.x, *slow):
-        end = yield from _with_poles(fit, x, fit.constraints, figures)
-        held += [] if end is None else [fit.places.pack(end.values or {})]
-    best = yield from _gone_on(fit, best, figures)
-    slow_ones = [start for x in slow for start in (x, *fit.sign_variants(x, same=True))]
-    for start in (*fit.sign_variants(here.x, same=True), *fit.sign_variants(here.x), *slow_ones, *held):
-        end = yield from _constrained(_Iterate.of(fit, start), figures, SIGNED)
+        end = yield from _with_poles(problem, x, problem.builders, figures)
+        held += [] if end is None else [criterion.variables.pack(end.values or {})]
+    best = yield from _gone_on(problem, best, figures)
+    slow_ones = [start for x in slow for start in (x, *sign_variants(problem, x, same=True))]
+    for start in (*sign_variants(problem, here.x, same=True), *sign_variants(problem, here.x), *slow_ones, *held):
+        end = yield from _constrained(_Iterate.of(problem, start), figures, SIGNED)
         if end is None or best is not None and not end.objective < best.objective * (1 + CONFLICT):
             continue
-        end = yield from _gone_on(fit, end, figures)
-        if _is_inside(fit, end) and (best is None or end.objective < best.objective):
+        end = yield from _gone_on(problem, end, figures)
+        if _is_inside(problem, end) and (best is None or end.objective < best.objective):
             best = end
     return best
 
 
-def _gone_on(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) -> Procedure:
+def _gone_on(problem: Problem, end: Evidence | None, figures: Mapping[str, Any]) -> Procedure:
     """Go on from an end that has not arrived, while that lowers the errors by what is worth it or leads inside."""
     for _ in range(GOING):
         if end is None or end.status is Status.LOCAL:
             break
-        again, inside = (yield from _constrained(_end_of(fit, end), figures)), _is_inside(fit, end)
-        if again is None or inside and not (_is_inside(fit, again) and again.objective < end.objective):
+        again, inside = (yield from _constrained(_end_of(problem, end), figures)), _is_inside(problem, end)
+        if again is None or inside and not (_is_inside(problem, again) and again.objective < end.objective):
             break
         worth = not inside or again.objective < end.objective * (1 - WORTH)
         end = again
@@ -289,12 +300,12 @@ def _gone_on(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) 
     return end
 
 
-def _is_inside(fit: TangentFit, end: Evidence | None) -> bool:
-    return end is not None and _end_of(fit, end).outside <= INSIDE
+def _is_inside(problem: Problem, end: Evidence | None) -> bool:
+    return end is not None and _end_of(problem, end).outside <= INSIDE
 
 
-def _end_of(fit: TangentFit, end: Evidence) -> _Iterate:
-    return _Iterate.of(fit, fit.places.pack(end.values or {}))
+def _end_of(problem: Problem, end: Evidence) -> _Iterate:
+    return _Iterate.of(problem, criterion_of(problem).variables.pack(end.values or {}))
 
 
 def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) -> Procedure:
@@ -306,7 +317,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) 
     for count in range(1, most + 1):
         at = curvature.add_to(here.at) if curvature.used else here.at
         plain = at is here.at and not damping
-        solution = yield here.program if plain else here.fit.pose(here.x, at, damping)
+        solution = yield here.tangent if plain else step_problem(here.problem, here.x, at, damping)
         if not solution.has_point and at is not here.at:
             curvature.used = False
             continue
@@ -322,7 +333,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) 
             continue
         answered, step = True, here.step(solution)
         gain, new = here.gain(step, at), here.move_to(here.x + step)
-        duals = [solution.duals[name] for name in here.program.constraint_names if name in solution.duals]
+        duals = [solution.duals[name] for name in here.tangent.constraint_names if name in solution.duals]
         needed = max((2.0 * float(np.max(np.abs(dual), initial=0.0)) for dual in duals), default=0.0)
         weight = max(needed, (weight + needed) / 2)  # multipliers far from the constraints may be huge
         if here.at.value < since * (1 - BETTER):  # little is promised, and more is gained in between
@@ -381,7 +392,7 @@ def _shortened(here: _Iterate, weight: float) -> Generator[Problem, Solution, _I
 
     A part of the way there is off it, where the point to start from is.
     """
-    solution = yield here.program
+    solution = yield here.tangent
     if not solution.has_point:
         return None
     step = here.step(solution)
@@ -394,7 +405,7 @@ def _shortened(here: _Iterate, weight: float) -> Generator[Problem, Solution, _I
 
 def _ended(here: _Iterate, reason: str, last: float, figures: Mapping[str, Any]) -> Procedure:
     """Judge where the iteration stopped by one more undamped programme."""
-    solution = yield here.program
+    solution = yield here.tangent
     if solution.has_point and here.outside <= INSIDE and here.negligible(here.gain(here.step(solution)), STALLED):
         return here.evidence(*here.judge(solution, STALLED), figures)
     reason = f"{reason}; the last undamped one promised {last / here.at.value:.0e} of the value"

@@ -13,6 +13,7 @@ from optid.data.levels import remove_levels
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.identify.arguments import Offset, check_offset, enough_rows, one_output, outputs_present, per_channel
+from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.criterion import Criterion
 from optid.models import HammersteinTF, Nonlinearity, recursions, roots
 from optid.models.gauges import gauge_factor, plant_sign
@@ -75,6 +76,10 @@ class TransferErrors(TransferPredictor, Criterion):
         if self.shifts is not None:
             model = model.with_output_levels(self.shifts)
         return model.with_transform(self.units)
+
+    def compressed_near(self, at: Linearised, x: Array) -> CompressedErrors:
+        """Return the compressed errors near x, ``at`` the errors there."""
+        return CompressedErrors(self, at, x)
 
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x."""

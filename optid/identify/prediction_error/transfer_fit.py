@@ -2,15 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 from optid.arrays import LARGEST_INTEGER, Array, check_integer
 from optid.core.problem import Problem
 from optid.identify.arguments import enough_rows
-from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.search import entry, search, starts_of
 from optid.identify.prediction_error.tangent_descent import refine
-from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.solving.solve import Procedure
 
@@ -33,5 +30,5 @@ def fit_transfer(errors: TransferErrors, starts: int, seed: int, pose: Callable[
     free = errors if errors.gauge == "none" else replace(errors, gauge="norm")
     best, others, figures = search(free, lambda part: starts_of(part, starts, seed))
     enough_rows(best.at.rows, errors.errors, errors.unknowns.size, "lags")
-    fit = TangentFit(pose(errors.normalise(best.x)), errors, partial(CompressedErrors, errors))
-    return (yield from refine(fit, best, figures, entry(fit, free, [best, *others])))
+    problem = pose(errors.normalise(best.x))
+    return (yield from refine(problem, best, figures, entry(problem, free, [best, *others])))

@@ -310,9 +310,9 @@ class ProcessErrors(Criterion):
         u = self.unknowns
         return linearise_errors(self.rows(x), u.experiments, u.n, u.shared, method=method)
 
-    def compress(self, at: Linearised, reference: Array) -> CompressedErrors:
-        """Return the compressed errors near a point."""
-        return (CompressedErrors if self.unknowns.outputs == 1 else CompressedOutputs)(self, at, reference)
+    def compressed_near(self, at: Linearised, x: Array) -> CompressedErrors:
+        """Return the compressed errors near x, ``at`` the errors there."""
+        return (CompressedErrors if self.unknowns.outputs == 1 else CompressedOutputs)(self, at, x)
 
     def value(self, x: Array) -> float:
         """Return the sum of squared errors at x."""

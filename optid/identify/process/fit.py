@@ -13,7 +13,7 @@ from optid.core.problem import Problem
 from optid.identify.arguments import enough_rows
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import CONFIRMED, refine
-from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
+from optid.identify.prediction_error.tangent_problem import INSIDE, excess
 from optid.identify.process.descent import (
     LONG,
     ProcessBox,
@@ -72,8 +72,7 @@ class ProcessFit:
 
     def refine(self, problem: Problem, x: Array, figures: Mapping[str, Any], steps: int = 0) -> Procedure:
         """Let a back end confirm a point, or go on from it."""
-        fit = TangentFit(problem, self.errors, self.errors.compress)
-        return (yield from refine(fit, Descent(x, self.errors.linearise(x), steps, True), figures, x))
+        return (yield from refine(problem, Descent(x, self.errors.linearise(x), steps, True), figures, x))
 
     def confirm(self, x: Array, figures: Mapping[str, Any], steps: int = 0, late: float = np.inf) -> Procedure:
         """Confirm a point; numbers at their usual bounds, and dead times that are not late, stay within."""
@@ -129,7 +128,7 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[ProcessErrors, Array], 
         if end is None:
             return None
         at = errors.variables.pack(end.values or {})
-        ends.append((TangentFit(within, errors, errors.compress).excess(at) > INSIDE, end.objective, at))
+        ends.append((excess(within, at) > INSIDE, end.objective, at))
     return (yield from fit.confirm(min(ends, key=lambda one: one[:2])[2], figures))
 
 

@@ -27,9 +27,9 @@ from optid.errors import StructureError
 from optid.identify.arguments import in_memory
 from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.descent import Descent
+from optid.identify.prediction_error.signs import with_signs
 from optid.identify.prediction_error.state_errors import WILD, StateErrors
 from optid.identify.prediction_error.tangent_descent import NO_BOUND
-from optid.identify.prediction_error.tangent_fit import with_signs
 from optid.identify.simultaneous.courses import Courses, Expressions, Formula, Pose, Reading, check_size
 from optid.identify.subspace.plan import Plan
 from optid.models.roots import spectral_radius
