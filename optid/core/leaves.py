@@ -153,8 +153,19 @@ class Affine:
 Leaf = Product | Quantity | Affine
 
 
+class OwnNumbers:
+    """What holds objects of CVXPY, whose numbers no object that is made after them in another process must have."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_last_id": get_id()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        ID_COUNTER.count = max(ID_COUNTER.count, state.pop("_last_id"))
+        vars(self).update(state)
+
+
 @dataclass(frozen=True, eq=False)
-class LeafSpace:
+class LeafSpace(OwnNumbers):
     """All leaves of a problem one after another.
 
     Attributes:
@@ -164,13 +175,6 @@ class LeafSpace:
 
     start: Values
     symmetric: frozenset[str] = frozenset()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_last_id": get_id()}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        ID_COUNTER.count = max(ID_COUNTER.count, state.pop("_last_id"))  # CVXPY's next objects must have other ids
-        vars(self).update(state)
 
     @cached_property
     def places(self) -> dict[str, slice]:

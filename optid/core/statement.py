@@ -9,7 +9,7 @@ import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
 
-from optid.core.leaves import Affine, Product
+from optid.core.leaves import Affine, OwnNumbers, Product
 from optid.core.low_rank import LowRank
 from optid.core.problem import Problem
 from optid.core.terms import Squares, Values, stacked_expression, sum_of
@@ -21,7 +21,7 @@ AFFINE = frozenset({"zero", "below"})  # cones of constraints that are rows
 
 
 @dataclass(frozen=True, eq=False)
-class CvxpyStatement:
+class CvxpyStatement(OwnNumbers):
     """A problem in CVXPY; its variables begin with the values of its start.
 
     Attributes:
@@ -84,8 +84,8 @@ class CvxpyStatement:
         return cp.Problem(self.objective, [c for group in self.constraints.values() for c in group])
 
     def __getstate__(self) -> dict[str, Any]:
-        # solvers keep more with the CVXPY problem; the space of the problem keeps the numbers of its variables apart
-        return {name: value for name, value in vars(self).items() if name != "problem"}
+        # solvers keep more with the CVXPY problem
+        return {name: value for name, value in super().__getstate__().items() if name != "problem"}
 
     def assign(self, values: Values) -> None:
         """Write values into the variables, and those that follow from them."""

@@ -235,16 +235,19 @@ def _budget(view):
     return {"budget": cp.sum(view["x"]) <= 2}
 
 
-def test_a_pickled_programme_does_not_share_ids_with_what_is_made_after_it(monkeypatch):
+@pytest.mark.parametrize(("restrictions", "point"), [((_budget,), 1.0), ((), 2.0)])
+def test_a_pickled_problem_does_not_share_ids_with_what_is_made_after_it(monkeypatch, restrictions, point):
     from cvxpy.lin_ops.lin_utils import ID_COUNTER  # not public: this fails first if CVXPY counts otherwise
 
     objective = Squares(np.eye(2), np.full(2, 2.0), 0.0, ("x",))
-    packed = pickle.dumps(for_solvers(Problem("projection", {"x": np.zeros(2)}, (objective,), restrictions=(_budget,))))
+    problem = for_solvers(Problem("projection", {"x": np.zeros(2)}, (objective,), restrictions=restrictions))
+    statement_of(problem)
+    packed = pickle.dumps(problem)
     monkeypatch.setattr(ID_COUNTER, "count", 0)  # as in another process
-    program = pickle.loads(packed)
-    known = {v.id for v in statement_of(program).problem.variables()}
+    problem = pickle.loads(packed)
+    known = {v.id for v in statement_of(problem).problem.variables()}
     assert not known & {cp.Variable().id for _ in range(max(known) + 1)}
-    assert solve(program, "clarabel").values["x"] == pytest.approx([1.0, 1.0], abs=1e-6)
+    assert solve(problem, "clarabel").values["x"] == pytest.approx([point, point], abs=1e-6)
 
 
 @pytest.mark.sampled(2)
