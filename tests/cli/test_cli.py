@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 import optid
 from optid.cli.app import app
 from optid.cli.terminal import spread
-from optid.core.statement import for_solvers
+from optid.core.problem import Problem
+from optid.core.statement import for_solvers, statement_of
 from optid.descriptions import describe
 from optid.examples import EXAMPLES, example
 from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, find_entry_points
@@ -291,13 +292,11 @@ def test_a_formulation_documents_the_variables_it_poses(name):
     function = find_entry_points(FORMULATIONS)[name].load()
     parameters = inspect.signature(function).parameters
     assert list(found.signature.parameters) == list(parameters)
-    problem = for_solvers(function(data, **{key: value for key, value in offered.items() if key in parameters}))
-    if hasattr(problem, "view"):
-        view = problem.view
-    elif "shooting" in name or "ss.exact" in name or "lfr" in name:  # behind the steps that find the start
-        view = for_solvers(last_programme(problem)).view
-    else:
-        view = for_solvers(next(problem)).view
+    problem = function(data, **{key: value for key, value in offered.items() if key in parameters})
+    if not isinstance(problem, Problem):
+        behind = "shooting" in name or "ss.exact" in name or "lfr" in name  # the steps that find the start
+        problem = last_programme(problem) if behind else next(problem)
+    view = statement_of(for_solvers(problem)).view
     courses = {"output y", "states of x", "x0"}  # with the names of a plant of equations
     own = {*plant.states, *plant.parameters, *courses} if name == "physical" else set()
     assert set(found.variables) == set(view) - own
