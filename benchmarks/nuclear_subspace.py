@@ -29,7 +29,8 @@ import numpy as np
 import optid
 from formulations.nuclear_subspace import low_rank
 from optid.backends import Settings, find
-from optid.core.statement import for_solvers
+from optid.core.low_rank import LowRankForm
+from optid.core.statement import for_solvers, statement_of
 from optid.identify.subspace.low_rank import held_out_fit, order_scores, structure
 from optid.identify.subspace.plan import Plan
 from optid.solving.solve import solve
@@ -83,11 +84,12 @@ def race(structured, weight: float, solvers: list[str], accuracy: float, repeats
     for _ in range(repeats):
         fresh = for_solvers(low_rank(structured, structured.penalty(weight)))
         # the Gram matrix is decomposed anew: it belongs to the time of one solve
+        numbers = LowRankForm.of(fresh).problem
         for name in ("gram", "groups", "index", "known", "data"):
-            fresh.structure.problem.__dict__.pop(name, None)
-        if fresh.structure.problem.predictor is not None:
+            numbers.__dict__.pop(name, None)
+        if numbers.predictor is not None:
             for name in ("stacked", "gram", "inverse", "places"):
-                fresh.structure.problem.predictor.__dict__.pop(name, None)
+                numbers.predictor.__dict__.pop(name, None)
         clock = time.process_time()
         answer = find("admm").run(fresh, Settings(accuracy=accuracy))
         times.append(time.process_time() - clock)
@@ -98,7 +100,7 @@ def race(structured, weight: float, solvers: list[str], accuracy: float, repeats
     for solver in solvers:
         fresh = for_solvers(low_rank(structured, structured.penalty(weight)))
         clock = time.process_time()
-        fresh.problem.get_problem_data(solver.upper())
+        statement_of(fresh).problem.get_problem_data(solver.upper())
         compiled = time.process_time() - clock
         clock = time.process_time()
         claim = find(solver).run(fresh, Settings(accuracy=accuracy))

@@ -95,14 +95,15 @@ def _programmes(cell: Cell) -> list[tuple[Problem, Solution]]:
     found: list[tuple[Problem, Solution]] = []
     with warnings.catch_warnings(), suppress(StopIteration, OptidError, ArithmeticError, np.linalg.LinAlgError):
         warnings.simplefilter("ignore")  # the row of the cell has the reason of a failure
-        problem = for_solvers(build_problem(cell.formulation_name, load(cell).data, cell.constraints, cell.options))
-        program = problem if isinstance(problem, Problem) else for_solvers(next(problem))
+        made = build_problem(cell.formulation_name, load(cell).data, cell.constraints, cell.options)
+        procedure: Any = None if isinstance(made, Problem) else made
+        problem = for_solvers(made if procedure is None else next(procedure))
         while True:
-            solution = solve(program, accuracy=ACCURACY, time_limit=cell.time_limit, prove=False)
-            found.append((program, solution))
-            if program is problem:
+            solution = solve(problem, accuracy=ACCURACY, time_limit=cell.time_limit, prove=False)
+            found.append((problem, solution))
+            if procedure is None:
                 break
-            program = for_solvers(problem.send(solution))
+            problem = for_solvers(procedure.send(solution))
     return found
 
 

@@ -121,8 +121,8 @@ def _first_programme(entry: FormulationEntry, record: Data) -> Any:
     """Return the programme of a formulation on a record, or the first one of a procedure."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        problem = for_solvers(build_problem(entry.formulation, record, entry.constraints, entry.options))
-        return problem if isinstance(problem, Problem) else for_solvers(next(problem))
+        made = build_problem(entry.formulation, record, entry.constraints, entry.options)
+        return for_solvers(made if isinstance(made, Problem) else next(made))
 
 
 def build_problem(formulation: str, record: Data, constraints: Sequence[str], options: Mapping[str, Any]) -> Any:

@@ -64,8 +64,8 @@ def fit_states(name: str, data: Data, *, pose: Pose, subspace: SubspaceSteps, ex
     """
     settings = StateSettings(**words)
     criterion, constraints, feedback_basis = settings.criterion, settings.constraints, settings.feedback_basis
-    for what, words in WORDS.items():
-        one_of(what, getattr(settings, what), words)
+    for what, allowed in WORDS.items():
+        one_of(what, getattr(settings, what), allowed)
     check_integer(settings.iterations, "iterations", 1 if finish is None else 0)
     record = in_memory(data, f"{criterion} errors")
     constants = check_offset(settings.offset, record)

@@ -12,7 +12,7 @@ from optid.data.channels import Transform, model_meta
 from optid.data.levels import remove_levels
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
-from optid.identify.arguments import Offset, check_offset, enough_rows, one_output, outputs_present, per_channel
+from optid.identify.arguments import check_offset, enough_rows, one_output, outputs_present, per_channel
 from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.criterion import Criterion
 from optid.models import HammersteinTF, Nonlinearity, recursions, roots
@@ -187,7 +187,7 @@ class TransferOrders(NamedTuple):
     nd: int | None = 0  # None where D is A
 
 
-def transfer_errors(data: Data, orders: TransferOrders, basis: Any, gauge: str | None, offset: Offset
+def transfer_errors(data: Data, orders: TransferOrders, basis: Any, gauge: str | None, offset: Any
                     ) -> TransferErrors:
     """Check the arguments of a fit, and return its criterion on the record in its own units (`optid.program.units`).
 
