@@ -375,7 +375,7 @@ def test_long_records_are_searched_in_part():
 
 @pytest.mark.parametrize("change, error, words", [
     ({"na": -1}, StructureError, "na .the number of poles. must be"),
-    ({"na": 2.0}, StructureError, "na (the number of poles) must be a nonnegative integer; got 2.0"),
+    ({"na": 2.0}, StructureError, r"na \(the number of poles\) must be a nonnegative integer; got 2.0"),
     ({"nb": 0}, StructureError, "nb of input 'u' must be a positive integer"),
     ({"nb": [1, 2]}, StructureError, "2 entries for 1 inputs"),
     ({"nk": -1}, StructureError, "nk of input 'u' must be a nonnegative integer"),
