@@ -100,8 +100,8 @@ def test_the_table_in_the_documentation_says_that_nothing_is_unverified():
 
     shipped = {name for name,
                point in find_entry_points(FORMULATIONS).items() if point.value.startswith("formulations.")}
-    # physical is for equations of one's own, process.exact for inputs that move a few times
-    assert names == shipped - {"physical", "process.exact"} and all(f"`{name}" in text for name in names)
+    # physical is for equations of one's own
+    assert names == shipped - {"physical"} and all(f"`{name}" in text for name in names)
 
 
 def test_every_key_and_every_study_is_documented():
