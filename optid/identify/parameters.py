@@ -86,15 +86,18 @@ def parameters(fit: Any, level: float = 0.95) -> Parameters:
     check_probability(level, "level")
     known, reason = uncertainty_or_reason(fit)
     known = None if known is None else known.at_level(level)
-    rows = [Parameter(name, value) for name, value in fit.model.coefficients()] if known is None else [
-        Parameter(*row) for row in known.table()]
-    if hasattr(fit.model, "coefficient_units"):
-        units = fit.model.coefficient_units()
-        rows = [row._replace(unit=units.get(row.name, "")) for row in rows]
+    rows = coefficient_parameters(fit.model, known)
     for function in static_functions(fit.model):
         if not function.is_linear:
             rows += function_parameters(function, known)
     return Parameters(tuple(rows), level, reason)
+
+
+def coefficient_parameters(model: Any, known: Any) -> list[Parameter]:
+    """Return the coefficients of a model with their units, and with errors where the uncertainty is known."""
+    rows = [Parameter(*row) for row in (model.coefficients() if known is None else known.table())]
+    units = model.coefficient_units() if hasattr(model, "coefficient_units") else {}
+    return [row._replace(unit=units.get(row.name, "")) for row in rows]
 
 
 def uncertainty_or_reason(fit: Any) -> tuple[Any, str]:

@@ -177,7 +177,7 @@ class Uncertainty:
     def with_profile(self, name: str, row: Sequence[float]) -> Array:
         """Return (estimate, standard error, lower, upper) of a parameter, with the ends of its profile if any."""
         coloured = "coloured" in getattr(self.source, "words", ())
-        ends = None if self.profiles is None else self.profiles(name, self.level, row[1] if coloured else None)
+        ends = None if self.profiles is None else self.profiles(name, self.level, row[0], row[1], coloured)
         return np.array(row if ends is None else (*row[:2], *ends), dtype=float)
 
     def table(self) -> list[tuple[str, float, float, float, float]]:

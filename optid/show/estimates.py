@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.bases.splines import Triangular
-from optid.identify.parameters import Parameter, Parameters, function_parameters
+from optid.identify.parameters import Parameter, Parameters, coefficient_parameters, function_parameters
 from optid.identify.parameters import uncertainty_or_reason as uncertainty
 from optid.models.functions import static_functions
 from optid.show.wording import Table, number
@@ -26,18 +26,18 @@ def parameter_tables(fit: "Fit") -> list[Table]:
     known, reason = uncertainty(fit)
     found = []
     if known is not None:
-        rows = [interval_row(name, *row) for name, *row in known.table()]
         state_space = fit.model.structure == "ss"
-        found.append(Table("Poles and static gain" if state_space else "Parameters",
-                           ("parameter", "estimate", "std. error", "95 % low", "95 % high"), rows, _remark(known)))
+        found.append(_parameter_table("Poles and static gain" if state_space else "Parameters",
+                                      coefficient_parameters(fit.model, known), False, note=_remark(known)))
         if not state_space:
             return found
-    rows = [(name, number(value)) for name, value in fit.model.coefficients()]
+    rows = coefficient_parameters(fit.model, None)
     title, note = ("Parameters", f"No standard errors: {reason.rstrip('.')}.") if known is None else (
         "Matrices", "They depend on the choice of state coordinates, which no record determines.")
     if len(rows) <= MOST_ROWS:
-        return [*found, Table(title, ("parameter", "estimate"), rows, note)]
-    return [*found, Table(title, ("parameter", "estimate") * ABREAST, _abreast(rows), note)]
+        return [*found, _parameter_table(title, rows, True, note=note)]
+    cells = _abreast([(row.name, number(row.estimate)) for row in rows])
+    return [*found, Table(title, ("parameter", "estimate") * ABREAST, cells, note)]
 
 
 def _remark(known: Any) -> str:

@@ -71,8 +71,10 @@ def judgement(found: "Verdict") -> str:
 
 def verdict_table(found: "Verdict") -> Table:
     """The tests behind the verdict on a model, each with its value and outcome."""
-    rows = [(part.name, part.value, part.outcome) for part in found.parts]
-    return Table("", ("test", "value", "outcome"), rows)
+    cut = [(part, *part.value.partition(": ")[::2]) if part.outcome == "-" else (part, part.value, "")
+           for part in found.parts]  # the reason why a test is not available is a sentence, and no cell
+    note = "; ".join(f"{part.name}: {reason}" for part, _, reason in cut if reason)
+    return Table("", ("test", "value", "outcome"), [(part.name, value, part.outcome) for part, value, _ in cut], note)
 
 
 def fit_table(fit: "Fit") -> Table:

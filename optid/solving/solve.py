@@ -123,9 +123,9 @@ class Evidence:
     extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
     # of the variables of the last programme at the model, where the model is not that of its solution
     values: Mapping[str, Any] | None = None
-    # (name of a parameter, level, standard error under coloured errors or None) -> ends of its interval by profile
-    # likelihood, None for parameters whose errors are all but quadratic
-    profiles: Callable[[str, float, float | None], tuple[float, float] | None] | None = None
+    # (name of a parameter, level, estimate, standard error, whether that is one under coloured errors) -> ends of its
+    # interval by profile likelihood, None for parameters whose errors are all but quadratic
+    profiles: Callable[[str, float, float, float, bool], tuple[float, float] | None] | None = None
     # the step whose programme the objective is that of, "" for the last one
     main: str = ""
 

@@ -74,7 +74,7 @@ def verdict_view(fit: Any) -> dict[str, Any]:
     """Return the verdict on a fit and its residual tests."""
     found = fit.verdict
     return {"word": found.word, "tone": TONES[found.word], "sentence": summary.judgement(found),
-            "parts": [list(row) for row in summary.verdict_table(found).rows],
+            "parts": [[part.name, part.value, part.outcome] for part in found.parts],
             "charts": [encode_chart(one) for one in charts.correlation_charts(charts.validate_quietly(fit.model,
                                                                                                       fit.data.raw()))]}
 

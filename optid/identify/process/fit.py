@@ -10,6 +10,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.core.problem import Problem
+from optid.errors import InfeasibleError
 from optid.identify.arguments import enough_rows
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import CONFIRMED, refine
@@ -27,7 +28,7 @@ from optid.identify.process.descent import (
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.order import choose_types
 from optid.identify.process.pairs import for_outputs
-from optid.identify.process.profile import DeadTimeProfiles
+from optid.identify.process.profile import ProcessProfiles
 from optid.identify.process.proof import REASON, applies, better_start, certify
 from optid.identify.process.separation import (
     describe_bounds,
@@ -117,7 +118,7 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[ProcessErrors, Array], 
             evidence = _judged_along(bests, boxes, evidence)
         if evidence.status is Status.LOCAL and not all(map(applies, errors.each)):
             evidence = replace(evidence, reason=REASON)
-        return replace(evidence, profiles=DeadTimeProfiles(errors, boxes, bests),
+        return replace(evidence, profiles=ProcessProfiles(errors, boxes, bests),
                        bound=partial(_certified, errors, boxes, bests))
     ends = []
     for number in range(max(len(one.points) for one in found) + 1):
@@ -143,8 +144,9 @@ def _searched(errors: ProcessErrors, box: ProcessBox, complete: bool) -> Found:
         best, steps = sharpen(join_equal(_past_the_grid(best, box)), box)
         best = join_equal(best)
         refuse_silence(best)
+        motion = warn_of_motion(best)  # first: it may be why times do not separate
         refuse_inseparable(best, box)
-        told = {"start": warn_of_motion(best), "bounds": describe_bounds(best),
+        told = {"start": motion, "bounds": describe_bounds(best),
                 "not determined": describe_flatness(best), "time constants": describe_equal_ones(best)}
         figures |= {name: said for name, said in told.items() if said}
     return Found(best, points, figures, steps)
@@ -194,8 +196,13 @@ def _middle(errors: ProcessErrors, box: ProcessBox) -> Array:
 
 def read_boxes(problem: Problem, errors: ProcessErrors, boxes: Sequence[ProcessBox]
                ) -> tuple[Sequence[ProcessBox], bool]:
-    """Return the boxes within the constraints that bound one number each, and whether these are all."""
+    """Return the boxes within the constraints that bound one number each, and whether these are all.
+
+    Raises:
+        InfeasibleError: a number is bounded to values that are not tried.
+    """
     low, high = (np.concatenate(ends) for ends in zip(*((box.low, box.high) for box in boxes)))
+    usual = low.copy(), high.copy()
     complete, every = True, np.arange(problem.space.size)
     places = np.concatenate([every[problem.space.places[errors.key("dynamics", p)]]
                              for p in range(len(errors.unknowns.pairs))])
@@ -213,14 +220,23 @@ def read_boxes(problem: Problem, errors: ProcessErrors, boxes: Sequence[ProcessB
             j, end = int(np.flatnonzero(places == used[0])[0]), float(right / row[used[0]])
             if one.cone == "zero" or row[used[0]] > 0:
                 high[j] = min(high[j], end)
-            if one.cone == "zero":
-                low[j] = high[j] = end
-            elif row[used[0]] < 0:
+            if one.cone == "zero" or row[used[0]] < 0:
                 low[j] = max(low[j], end)
-    if np.any(low > high):
+    for j in np.flatnonzero((low > usual[1]) | (high < usual[0])):
+        _refuse_untried(errors, int(j), *(float(end[j]) for end in usual))
         return boxes, False
     edges = np.cumsum([len(box.low) for box in boxes])[:-1]
     return [ProcessBox(*ends) for ends in zip(np.split(low, edges), np.split(high, edges))], complete
+
+
+def _refuse_untried(errors: ProcessErrors, j: int, low: float, high: float) -> None:
+    """Refuse constraints that ask for a number beyond its usual bounds."""
+    p, name = errors.unknowns.numbers[j]
+    ends = np.exp([low, high]) if errors.unknowns.logarithmic[j] else np.array([low, high])
+    words = [f"{end * (1 if name == 'zeta' else errors.data.dt):.4g}" for end in ends]
+    raise InfeasibleError(f"the constraints leave no value of {errors.key(name, p)} from {' to '.join(words)} "
+                          f"{errors.data.time_unit * (name != 'zeta')}".rstrip() + ", which is all that a record of "
+                          "this length and sampling time can show: relax them, or use a longer or faster record")
 
 
 def _numbers(errors: ProcessErrors, view: Any) -> cp.Expression:

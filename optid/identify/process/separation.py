@@ -13,6 +13,7 @@ from optid.phrases import p_equals
 
 CHANCE = 1e-3  # p value of the F test above which the output does not visibly respond
 MOVING, EXACT = 1e-4, 1e-12  # p value, and share of the energy of the output, below which a motion counts as none
+USUAL = 10.0  # time constants that a record of a step is long
 NEAR = 0.02  # of a logarithm from its bound that counts as none
 MANYFOLD = 3.0  # standard error of a logarithm from which on a time constant is not determined
 SHARE = 0.1  # of a direction from which on a parameter takes part in it
@@ -76,6 +77,8 @@ def warn_of_motion(best: ProcessPoint) -> str:
         return ""
     free = replace(errors, unknowns=replace(u, free=True))
     x = np.concatenate([best.x[: u.shared], np.zeros(free.unknowns.size - u.shared)])
+    unseen = [place for place, (_, name) in zip(u.dynamic, u.numbers) if name in ("tau", *TAUS, "T") and x[place] < 0]
+    x[unseen] = np.log(errors.length / USUAL)  # below a sampling time they may be what a motion has made of them
     motions = free.columns(x)[:, len(u.linear) - u.n * u.experiments :]
     known = np.column_stack([best.columns, errors.slopes(best.x)])
     basis = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))[0]
