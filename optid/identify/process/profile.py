@@ -1,8 +1,8 @@
 """Intervals by profile likelihood: everything else is fitted again at every value of a dead time or a time constant.
 
 Errors have kinks in a dead time, and it may lie at zero, as may a time constant that is hardly seen; the profile says
-what the quadratic approximation behind a standard error does not. Under coloured errors the likelihood ratio is divided by how much larger the variance of the
-estimate is than under white ones (Chandler and Bate, Biometrika 94, 2007).
+what the quadratic approximation behind a standard error does not. Under coloured errors the likelihood ratio is divided
+by how much larger the variance of the estimate is than under white ones (Chandler and Bate, Biometrika 94, 2007).
 """
 
 from collections.abc import Sequence
