@@ -15,7 +15,7 @@ from optid.errors import DataError, StructureError
 from optid.models import roots
 from optid.models.experiments import check_inputs, samples_of, state_like
 from optid.models.export import control_names, control_package
-from optid.models.held_inputs import held_step, irregular_course, regular_course, run_course, split_delays
+from optid.models.held_inputs import held_step, run_held, split_delays
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.pole_table import PoleTable
 
@@ -184,14 +184,12 @@ class ContinuousModel(Ports):
             raise StructureError("Give either dt= for regular samples or times= for others.")
         w = np.column_stack([f(samples[:, c]) for f, c in zip(self.nonlinearities, self.input_of)]
                             ) if self.nonlinearities else np.zeros((len(samples), 0))
-        if times is None:
-            course = regular_course(len(w), sampling_time(dt), self.dead_time)
-        else:
-            course = irregular_course(_instants(times, len(w)), self.dead_time)
+        unit, t = (sampling_time(dt), np.arange(float(len(w)))) if times is None else (1.0, _instants(times, len(w)))
         start, before = self._start(x0, w[0])
+        system = unit * self.A, unit * self._driven, self.C, np.column_stack([self.D, np.zeros(self.l)])
         with np.errstate(all="ignore"):
-            states, drives = run_course(self.A, self._driven, start, course, w, before)
-            y = states @ self.C.T + drives @ self.D.T + self.offset_y
+            y = self.offset_y + run_held(system, np.append(self.dead_time / unit, 0.0), t - t[0],
+                                         np.column_stack([w, np.ones(len(w))]), before, start)
         if not np.isfinite(y).all():
             k, o = np.argwhere(~np.isfinite(y))[0]
             raise DataError(f"The simulation of output {self.outputs[o]!r} leaves the range of numbers at sample {k}: "

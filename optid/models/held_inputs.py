@@ -5,34 +5,39 @@ exp(t [A B; 0 0]) of the state and the drive; the matrix logarithm takes such a 
 """
 
 import warnings
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm, logm, matrix_balance
 
 from optid.arrays import Array
 from optid.errors import StructureError
-from optid.models.recursions import late_njit
+from optid.models.process_kernel import run, thin_out
 
 SAME = 1e-9  # share of the shortest sampling interval within which two instants are one
-ALIKE = 1e-12  # share of the longest interval within which two intervals are one
 AMBIGUOUS = 1e-6  # angle from the negative real axis, in radians, within which a logarithm has no certain branch
 INVERSE = 1e-9  # relative error up to which exp(log(step)) counts as the step
-CHUNK = 1024  # matrix exponentials taken at a time
 
 
 def held_step(A: Array, B: Array, interval: float | Array) -> tuple[Array, Array]:
     """Return Phi (.., n, n) and Gamma (.., n, r): x(t + interval) = Phi x(t) + Gamma w while w is held."""
-    n, r = B.shape  # exponentials keep their digits where states and drives have units of one size
+    block, scale = _balanced(A, B)
+    n = len(A)
+    steps = expm(np.asarray(interval, dtype=float)[..., None, None] * block) * scale[:, None] / scale
+    return steps[..., :n, :n], steps[..., :n, n:]
+
+
+def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
+    """Return [A B; 0 0] in units in which exponentials keep their digits, and the sizes of states and drives."""
+    n, r = B.shape
     block, scale = np.zeros((n + r, n + r)), np.ones(n + r)
     if n:
         block[:n, :n], (scale[:n], _) = matrix_balance(A, permute=False, separate=True)
     block[:n, n:] = B / scale[:n, None]
     size, own = np.abs(block[:n, n:]).max(axis=0, initial=0.0), np.abs(block[:n, :n]).max(initial=0.0)
-    scale[n:] = np.where(size > 0, (own or 1.0) / np.where(size > 0, size, 1.0), 1.0)  # of the drives
+    scale[n:] = np.where(size > 0, (own or 1.0) / np.where(size > 0, size, 1.0), 1.0)
     block[:n, n:] *= scale[n:]
-    steps = expm(np.asarray(interval, dtype=float)[..., None, None] * block) * scale[:, None] / scale
-    return steps[..., :n, :n], steps[..., :n, n:]
+    return block, scale
 
 
 def held_equations(Phi: Array, Gamma: Array, interval: float) -> tuple[Array, Array]:
@@ -73,38 +78,6 @@ def held_equations(Phi: Array, Gamma: Array, interval: float) -> tuple[Array, Ar
     return equations[:, :n], equations[:, n:] * np.where(size > 0, size, 1.0)
 
 
-class Course(NamedTuple):
-    """Intervals between the instants at which a held drive changes or an output is read."""
-
-    lengths: Array  # (S,) of the intervals
-    drives: np.ndarray  # (S, r) the sample of every drive in an interval; -1 before the first one
-    reads: np.ndarray  # (N,) the interval at whose beginning every output is read
-
-
-def regular_course(count: int, dt: float, delays: Array) -> Course:
-    """Return the course of samples at 0, dt, 2 dt, .. with the delays (r,) of the drives."""
-    whole, rest = split_delays(delays, dt)
-    starts = np.unique(np.concatenate([[0.0], rest]))
-    late = rest > starts[:, None]  # in these parts of a sampling interval the drive is still the previous one
-    lengths = np.diff(np.concatenate([starts, [dt]]))
-    samples = np.arange(count)[:, None, None] - whole - late
-    return Course(np.tile(lengths, count), np.maximum(samples.reshape(-1, delays.size), -1),
-                  np.arange(count) * starts.size)
-
-
-def irregular_course(times: Array, delays: Array) -> Course:
-    """Return the course of samples at ascending times (N,) with the delays (r,) of the drives."""
-    shortest = float(np.min(np.diff(times), initial=np.inf))
-    same = SAME * (shortest if np.isfinite(shortest) else 1.0)
-    changes = times[:, None] + delays
-    near = np.clip(np.searchsorted(times, changes - same), 0, times.size - 1)
-    changes = np.where(np.abs(times[near] - changes) <= same, times[near], changes)
-    instants = np.unique(np.concatenate([times, changes[changes < times[-1]]]))
-    drives = np.column_stack([np.searchsorted(column, instants, side="right") - 1 for column in changes.T]
-                             ) if delays.size else np.zeros((instants.size, 0), dtype=int)
-    return Course(np.append(np.diff(instants), 0.0), drives, np.searchsorted(instants, times))
-
-
 def split_delays(delays: Array, dt: float) -> tuple[Array, Array]:
     """Split delays (r,) into numbers of whole sampling times and rests in [0, dt), exact where they are multiples."""
     whole = np.floor(delays / dt + SAME)
@@ -112,45 +85,28 @@ def split_delays(delays: Array, dt: float) -> tuple[Array, Array]:
     return whole.astype(int), np.where(rest > SAME * dt, rest, 0.0)
 
 
-def run_course(A: Array, B: Array, x0: Array, course: Course, w: Array, before: Array) -> tuple[Array, Array]:
-    """Run x' = A x + B w over a course; return the states (N, n) and the drives (N, r) where outputs are read.
+def run_held(system: tuple[Array, Array, Array, Array], delays: Array, instants: Array, w: Array, before: Array,
+             x0: Array) -> Array:
+    """Run x' = A x + B w, y = C x + D w over samples w (N, r), held from ascending instants (N,) on; return y (N, l).
 
-    w (N, r) are the samples of the drives, `before` (r,) their values before the first one. A last column of B without
-    a drive is a constant.
+    A drive takes its samples later by its entry of delays (r,), and has its value `before` (r,) until then; x0 (n,) is
+    the state at the first instant.
     """
-    r, drives = w.shape[1], np.vstack([w, before])  # the sample -1 is the last row
-    driven = np.take_along_axis(drives, course.drives, axis=0) if r else np.zeros((len(course.lengths), 0))
-    held = np.hstack([driven, np.ones((len(driven), B.shape[1] - r))])
-    grid = np.round(course.lengths / max(course.lengths.max(), 1e-300) / ALIKE)
-    _, index, counts = np.unique(grid, return_inverse=True, return_counts=True)
-    lengths = np.bincount(index, course.lengths) / counts
-    states = np.empty((len(index), len(A)))
-    x, march = np.array(x0, dtype=float), late_njit(_march)
-    if lengths.size <= CHUNK:
-        march(*map(np.ascontiguousarray, held_step(A, B, lengths)), index, held, x, states)
-        return states[course.reads], driven[course.reads]
-    for first in range(0, len(index), CHUNK):
-        part = slice(first, first + CHUNK)
-        steps = map(np.ascontiguousarray, held_step(A, B, course.lengths[part]))
-        x = march(*steps, np.arange(len(index[part])), held[part], x, states[part])
-    return states[course.reads], driven[course.reads]
-
-
-def _march(Phi, Gamma, index, held, x, states):
-    """Write the state at the beginning of every interval, and return that at the end of the last one."""
-    n, r = x.size, held.shape[1]
-    following = np.empty(n)
-    for s in range(index.size):
-        k = index[s]
-        for i in range(n):
-            states[s, i] = x[i]
-        for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += Phi[k, i, j] * x[j]
-            for j in range(r):
-                total += Gamma[k, i, j] * held[s, j]
-            following[i] = total
-        for i in range(n):
-            x[i] = following[i]
-    return x
+    A, B, C, D = system
+    block, scale = _balanced(A, B)
+    n, y = len(A), np.zeros((len(instants), len(C)))
+    same = SAME * float(np.min(np.diff(instants), initial=1.0))
+    for j, delay in enumerate(delays):
+        changes = instants + delay
+        near = np.clip(np.searchsorted(instants, changes - same), 0, len(instants) - 1)
+        changes = np.where(np.abs(instants[near] - changes) <= same, instants[near], changes)
+        late = int(changes[0] > instants[0])
+        changes, held = thin_out(np.append(instants[:late], changes), np.append(before[j : j + late], w[:, j])[:, None],
+                                 False)
+        F, start = np.zeros((n + 2, n + 2)), np.zeros((n + 2, 1))
+        F[0, 1], F[2:, 0], F[2:, 2:] = 1.0, block[:n, n + j], block[:n, :n]
+        if j == 0:
+            start[2:, 0] = x0 / scale[:n]
+        read = np.column_stack([D[:, j] * scale[n + j], np.zeros(len(C)), C * scale[:n]])
+        y += run(F, read, instants, changes, held / scale[n + j], (False, True), start)[:, :, 0]
+    return y

@@ -18,7 +18,8 @@ from optid.models.experiments import Record, check_inputs, in_units_of, scaled_l
 from optid.models.functions import static_functions
 from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
-from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thin_out
+from optid.models.process_dynamics import ProcessDynamics, ProcessStructure
+from optid.models.process_kernel import thin_out
 
 HOLDS = ("zero", "first")
 

@@ -279,14 +279,6 @@ def _second_order(f: Array, at: int, drive: Array, size: float, zeta: float) -> 
     return at + 2, np.eye(len(f))[at]
 
 
-def thin_out(changes: Array, inputs: Array, straight: bool) -> tuple[Array, Array]:
-    """Leave out the times (J,) at which inputs (J, M) take no new value; where they go straight, all are kept."""
-    if straight or len(changes) < 2:
-        return changes, inputs
-    moves = np.concatenate([[True], np.any(np.diff(inputs, axis=0) != 0, axis=1)])
-    return changes[moves], inputs[moves]
-
-
 def read_structures(process: Any, inputs: Sequence[str], outputs: Sequence[str] = ("y",)
                     ) -> tuple[tuple[ProcessStructure | None, ...], ...]:
     """Read the types of all pairs, a row per output; None or "none" where an input has no effect on it.

@@ -8,6 +8,7 @@ time is no part of the system: it moves the changes of the input against the ins
 
 import numpy as np
 
+from optid.arrays import Array
 from optid.kernel_cache import cached_njit
 
 SLOTS = 32  # exponentials that are kept; regular records have few lengths of steps
@@ -183,3 +184,11 @@ def run(F, C, instants, changes, inputs, sides, start):  # noqa: N803
                     out[k, o, c] = total
             k += 1
     return out
+
+
+def thin_out(changes: Array, inputs: Array, straight: bool) -> tuple[Array, Array]:
+    """Leave out the times (J,) at which inputs (J, M) take no new value; where they go straight, all are kept."""
+    if straight or len(changes) < 2:
+        return changes, inputs
+    moves = np.concatenate([[True], np.any(np.diff(inputs, axis=0) != 0, axis=1)])
+    return changes[moves], inputs[moves]

@@ -5,7 +5,8 @@ import pytest
 from scipy.linalg import expm
 
 from optid.errors import StructureError
-from optid.models.process_dynamics import TYPES, ProcessDynamics, ProcessStructure, thin_out
+from optid.models.process_dynamics import TYPES, ProcessDynamics, ProcessStructure
+from optid.models.process_kernel import thin_out
 
 VALUES = {"tau": 12.0, "tau1": 12.0, "tau2": 5.0, "tau3": 2.0, "T": 7.0, "zeta": 0.4, "tau_zero": -3.0,
           "dead_time": 4.37}

@@ -26,7 +26,8 @@ from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.process.unknowns import ProcessUnknowns
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.process import ProcessModel
-from optid.models.process_dynamics import ProcessDynamics, thin_out
+from optid.models.process_dynamics import ProcessDynamics
+from optid.models.process_kernel import thin_out
 from optid.program.compressed import Spread
 from optid.program.units import energy_unit, outer_bases
 from optid.statistics.linearised import Linearised, Method, linearise_errors
