@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from refusals import refuses
 from scipy import stats
-from scipy.optimize import minimize
+from scipy.optimize import minimize, nnls
 
 import optid
 from formulations.constraints import process as words
@@ -181,6 +181,7 @@ def test_static_curve_with_words():
     curve = flat.model.nonlinearities[0](np.linspace(-1, 1, 50))
     assert np.all(np.diff(curve) >= -1e-9) and flat.solution.objective >= free.solution.objective
     assert not free.solution.proof and "real poles" in free.solution.bound.reason
+    assert "9 increments" in flat.solution.bound.reason
 
 
 def test_a_model_is_saved_loaded_and_simulated(tmp_path):
@@ -308,6 +309,33 @@ def test_bounds_of_boxes_lie_below_every_point(seed):
             assert bound <= rest @ rest * (1 + 1e-9)
 
 
+def test_bounds_within_a_cone_lie_below_every_point():
+    rng = np.random.default_rng(0)
+    u, cone = np.repeat(rng.integers(0, 3, 8), 10) * 1.0, np.tril(np.ones((2, 2)))
+    truth = process_model("P1D", K=2.0, tau=12.0, dead_time=4.4)
+    errors = process_errors(record(truth, np.minimum(u, 1.2), 0.3), "P1D", "triangular:2", Terms())
+    low, size = np.column_stack([rng.uniform(0, 4, 60), rng.uniform(0, 20, 60)]), 10 ** rng.uniform(-3, 0.3, (60, 2))
+    boxes = np.column_stack([low, low + size])[:, [0, 2, 1, 3]]
+    lower, middle, _ = BranchAndBound(errors, usual_box(errors), cone).bounds(boxes)
+    assert np.sum(lower > 0.3 * middle) > 10
+    for (l1, l2, a, b), bound in zip(boxes, lower):
+        for share in rng.uniform(0, 1, (6, 2)):
+            x = np.zeros(errors.unknowns.size)
+            x[:2] = l1 + share[0] * (l2 - l1), a + share[1] * (b - a)
+            columns = errors.columns(x)
+            signed = np.column_stack([columns[:, :2] @ cone, columns[:, 2:], -columns[:, 2:]])  # levels of any sign
+            assert bound <= nnls(signed, errors.y)[1] ** 2 * (1 + 1e-9)
+
+
+def test_a_monotone_curve_of_few_increments_is_proved():
+    u = np.repeat([0.0, 2, 1, 0, 1, 2], 15)
+    data = record(process_model("P1D", K=2.0, tau=8.0, dead_time=4.4), np.minimum(u, 1.2), 0.05)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optid.errors.DataWarning)
+        found = fit(data, basis="triangular:2", constraints=["monotone", "tau:low=2,high=40", "dead_time:high=15"])
+    assert found.solution.proof and found.solution.gap < 2e-6 and found.solution.status is Status.OPTIMAL
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_random_step_tests_are_proved(seed):
     rng = np.random.default_rng([seed, 3])
@@ -424,6 +452,20 @@ def test_a_dead_time_beyond_the_record_is_refused():
     quiet = 5 + 0.04 * np.random.default_rng(0).normal(size=200)
     with pytest.raises(RankError, match=r"no response to u.*dead time may be longer.*Determined is its level alone, 5"):
         fit(optid.Data(STEP, quiet, dt=1.0))
+
+
+def test_bounds_that_leave_nothing_to_try_are_refused():
+    for word in ("dead_time:low=500", "dead_time:500", "tau:high=0.001", "tau:9999"):
+        name = word.split(":")[0]
+        with pytest.raises(InfeasibleError, match=f"leave no value of {name} from .* longer or faster"):
+            fit(record(), constraints=[word])
+
+
+def test_a_motion_is_named_where_it_keeps_times_from_separating():
+    y = FIRST.respond(STEP[:, None]) + 3 * np.exp(-T / 30)
+    with (pytest.warns(optid.errors.DataWarning, match="does not begin at rest.*initial='free'"),
+          pytest.raises(RankError, match="does not separate")):
+        fit(optid.Data(STEP, y + 0.04 * np.random.default_rng(0).normal(size=200), dt=1.0))
 
 
 def test_stamps_that_run_backwards_are_refused_by_sample():
@@ -591,6 +633,11 @@ def test_intervals_of_dead_times_are_those_of_the_profile():
         assert there.solution.objective == pytest.approx(most, rel=1e-4)
     shown = found.dynamics["dead time"]
     assert (shown.lower, shown.upper) == (found.params["dead_time"].lower, found.params["dead_time"].upper)
+
+
+def test_a_time_constant_that_is_hardly_seen_has_no_negative_one_in_its_interval():
+    found = fit(record(), "P2D", prove=False).params["tau2"]
+    assert found.estimate - 1.96 * found.error < 0 < found.lower < found.estimate < found.upper
 
 
 def test_real_poles_of_an_oscillation_are_equal_and_said_to_be():

@@ -103,7 +103,7 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[ProcessErrors, Array], 
     for one in errors.each:
         enough_rows(len(one.y), "output samples", one.unknowns.size, "poles")
     usual = [usual_box(one) for one in errors.each]
-    boxes, complete = read_boxes(fit.problem(errors.join(list(map(_middle, errors.each, usual)))), errors, usual)
+    boxes, complete, cone = read_boxes(fit.problem(errors.join(list(map(_middle, errors.each, usual)))), errors, usual)
     found = [_searched(one, box, complete) for one, box in zip(errors.each, boxes)]
     names = errors.data.outputs if len(found) > 1 else ("",)
     figures = {**({"process type": said} if auto else {}), **{f"{name}{' of ' * bool(output)}{output}": word
@@ -130,7 +130,10 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[ProcessErrors, Array], 
             return None
         at = errors.variables.pack(end.values or {})
         ends.append((excess(within, at) > INSIDE, end.objective, at))
-    return (yield from fit.confirm(min(ends, key=lambda one: one[:2])[2], figures))
+    evidence = yield from fit.confirm(min(ends, key=lambda one: one[:2])[2], figures)
+    if evidence is None or cone is None:
+        return evidence
+    return replace(evidence, bound=partial(certify, errors, evidence.objective / errors.unit, boxes[0], cone))
 
 
 def _searched(errors: ProcessErrors, box: ProcessBox, complete: bool) -> Found:
@@ -175,7 +178,7 @@ def _judged_along(bests: Sequence[ProcessPoint], boxes: Sequence[ProcessBox], ev
 
 def _certified(errors: ProcessErrors, boxes: Sequence[ProcessBox], bests: Sequence[ProcessPoint]) -> Bound:
     """Bound the sum of squares of every output from below, and so their sum."""
-    found = [certify(best, box) for best, box in zip(bests, boxes)]
+    found = [certify(best.errors, best.value, box) for best, box in zip(bests, boxes)]
     if len(found) == 1:
         return found[0]
     reasons = dict.fromkeys(bound.reason for bound in found)
@@ -195,27 +198,27 @@ def _middle(errors: ProcessErrors, box: ProcessBox) -> Array:
 
 
 def read_boxes(problem: Problem, errors: ProcessErrors, boxes: Sequence[ProcessBox]
-               ) -> tuple[Sequence[ProcessBox], bool]:
-    """Return the boxes within the constraints that bound one number each, and whether these are all.
+               ) -> tuple[Sequence[ProcessBox], bool, Array | None]:
+    """Return the boxes within the constraints that bound one number each, whether these are all, and a cone.
+
+    Where the others are as many rows about mu as it has coefficients, these are non-negative sums of the columns of the
+    cone (size, size).
 
     Raises:
         InfeasibleError: a number is bounded to values that are not tried.
     """
     low, high = (np.concatenate(ends) for ends in zip(*((box.low, box.high) for box in boxes)))
     usual = low.copy(), high.copy()
-    complete, every = True, np.arange(problem.space.size)
+    others, every = list[tuple[str, Array, float]](), np.arange(problem.space.size)
     places = np.concatenate([every[problem.space.places[errors.key("dynamics", p)]]
                              for p in range(len(errors.unknowns.pairs))])
     for one in problem.constraints():
         if one.name in problem.structural:
             continue
-        if one.cone not in ("zero", "below"):
-            complete = False
-            continue
         for row, right in zip(one.rows, one.right):
             used = np.flatnonzero(row)
-            if len(used) != 1 or used[0] not in places:
-                complete = False
+            if one.cone not in ("zero", "below") or len(used) != 1 or used[0] not in places:
+                others.append((one.cone, row, float(right)))
                 continue
             j, end = int(np.flatnonzero(places == used[0])[0]), float(right / row[used[0]])
             if one.cone == "zero" or row[used[0]] > 0:
@@ -224,9 +227,14 @@ def read_boxes(problem: Problem, errors: ProcessErrors, boxes: Sequence[ProcessB
                 low[j] = max(low[j], end)
     for j in np.flatnonzero((low > usual[1]) | (high < usual[0])):
         _refuse_untried(errors, int(j), *(float(end[j]) for end in usual))
-        return boxes, False
+        return boxes, False, None
     edges = np.cumsum([len(box.low) for box in boxes])[:-1]
-    return [ProcessBox(*ends) for ends in zip(np.split(low, edges), np.split(high, edges))], complete
+    found = [ProcessBox(*ends) for ends in zip(np.split(low, edges), np.split(high, edges))]
+    mu = problem.space.places[errors.key("mu", 0)]
+    rows = np.array([row for cone, row, right in others if cone == "below" and right == 0 and not np.delete(
+        row, every[mu]).any()]).reshape(-1, problem.space.size)[:, mu]
+    simplicial = len(rows) == len(others) == rows.shape[1] == np.linalg.matrix_rank(rows) and len(errors.each) == 1
+    return found, not others, -np.linalg.inv(rows) if simplicial else None
 
 
 def _refuse_untried(errors: ProcessErrors, j: int, low: float, high: float) -> None:

@@ -5,9 +5,14 @@ what was found. Anywhere in it the response is x = x0 + r with |r| bounded; wher
 x = x0 + sum a_i x_i + r with |a_i| <= h_i and a smaller r: least squares over K and K a_i in their cone, less the
 largest K |r|, is a lower bound (`step_courses` bounds r). Boxes are halved at kinks first. What is not discarded holds
 the optimum: its middle is a start that no grid can miss.
+
+A static curve whose constraints are a cone of as many rows as coefficients, such as a monotone one of few cells, is a
+sum of c_k g_k with c >= 0: the response is one of the c_k (x_k0 + sum a_i x_ki + r_k), which lies in the cone of the
+corners of the box, and non-negative least squares takes the place of least squares.
 """
 
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -16,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
-from optid.identify.process.descent import ProcessBox, ProcessPoint
+from optid.identify.process.descent import ProcessBox
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.step_courses import one_pole_courses, two_pole_courses
 from optid.models.process_dynamics import ProcessStructure
@@ -30,9 +35,13 @@ WORK, LEAST = 2e6, 1000  # responses to single moves that the coarse pass may co
 MOST = {2: 5e6, 3: 1e3}  # responses to single moves in one bound beyond which no proof is tried, by unknowns
 BATCH, ENTRIES = 2000, 200_000  # boxes that are bounded together, and entries of their courses
 RIDGE = 1e-13  # of scaled normal equations, for columns that are all but parallel
+FEW = 4  # increments of a static curve up to which a proof is tried
+MOVED, FURTHER = 8, 1.05  # times that errors are moved until they bound, and how far beyond
+ROUNDING = 1e-9  # of the conditions that they then obey, relative to their size
 METHOD = "branch and bound over time constants and dead time"
-REASON = ("a lower bound is known for one or two real poles with dead time, one held input, a straight static curve "
-          "and a start at rest alone; elsewhere several starts are compared")
+REASON = ("a lower bound is known for one or two real poles with dead time, one held input, a static curve that is "
+          "straight or whose constraints are as many as its coefficients (such as a monotone one), and a start at rest "
+          "alone; elsewhere several starts are compared")
 
 
 def most_explained(gram: Array, side: Array, h: Array) -> Array:
@@ -65,6 +74,40 @@ def most_explained(gram: Array, side: Array, h: Array) -> Array:
     return best
 
 
+def _nonnegative(columns: Array, y: Array) -> Array:
+    """Return the non-negative coefficients of columns (rows, k) that explain most of y; zeros where none are found."""
+    from scipy.optimize import nnls
+
+    with suppress(RuntimeError):  # too many steps
+        return nnls(columns, y)[0]
+    return np.zeros(columns.shape[1])
+
+
+def least_from_cone(rays: Array, rest: Array, y: Array) -> float:
+    """Return a lower bound on |y - sum c_j (ray_j + e_j)| over c >= 0 and all e_j no larger than their rest.
+
+    Any l with rays' l <= -rest |l| gives the bound l'y / |l|: here the errors of non-negative least squares, moved
+    until they obey.
+
+    Args:
+        rays: (rows, k).
+        rest: (k,) sizes.
+        y: (rows,).
+    """
+    triangle = np.linalg.qr(np.column_stack([rays, y]), mode="r")
+    rays, y = triangle[:, :-1], triangle[:, -1]
+    c = _nonnegative(rays, y)
+    dual = y - rays @ c
+    for _ in range(MOVED):
+        size = float(np.linalg.norm(dual))
+        excess = rays.T @ dual + rest * size
+        if np.all(excess <= ROUNDING * size):
+            return max(float(dual @ y), 0.0) / size if size else 0.0
+        held = (c > 0) | (excess > 0)
+        dual = dual - np.linalg.lstsq(rays[:, held].T, FURTHER * np.maximum(excess[held], 0.0), rcond=1e-12)[0]
+    return 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Search:
     """What a search over boxes ended with: the least bound of discarded boxes, the best middle, and what is left."""
@@ -82,6 +125,7 @@ class BranchAndBound:
 
     errors: ProcessErrors
     box: ProcessBox
+    cone: Array | None = None  # (size, k) coefficients mu are sums of its columns; a straight f has any gain
 
     @cached_property
     def kinks(self) -> Array:
@@ -96,7 +140,7 @@ class BranchAndBound:
         """Orthonormal columns (rows, c) that do not move, and the outputs (rows,) without them."""
         x = np.zeros(self.errors.unknowns.size)
         x[self.errors.unknowns.dynamic] = (self.box.low + self.box.high) / 2
-        still = np.linalg.qr(self.errors.columns(x)[:, 1:])[0]
+        still = np.linalg.qr(self.errors.columns(x)[:, self.errors.unknowns.sizes[0] :])[0]
         return still, self.errors.y - still @ (still.T @ self.errors.y)
 
     @property
@@ -104,35 +148,66 @@ class BranchAndBound:
         """Responses to single moves in one bound."""
         return max(sum(len(one.instants) * (len(drive.changes) - 1) for one, drive in self.errors.courses_of(0)), 1)
 
-    def bounds(self, boxes: Array) -> tuple[Array, Array, Array]:
-        """Return lower bounds (B,) on V over boxes (B, 2 d), V at their middles, and the effects (B, d) of halves."""
-        still, y = self.record
+    def _courses(self, boxes: Array, coefficients: Array) -> tuple[Array, Array, Array]:
+        """Return the courses (B, 1 + d, rows) of a static curve and their derivatives at the middles of boxes.
+
+        Then the sizes (B,) of what is left out by these courses, and by their tangents.
+        """
+        still, _ = self.record
         parts, smooth = [], self._inside(boxes) == 0
         for one, drive in self.errors.courses_of(0):
-            moves = one.instants, drive.changes[1:], np.diff(drive.values[:, 0])
+            values = drive.values @ coefficients
+            moves = one.instants, drive.changes[1:], np.diff(values)
             x, *rests = one_pole_courses(boxes, smooth, *moves) if boxes.shape[1] == 4 else two_pole_courses(
                 boxes, *moves)
-            x[:, 0] += drive.values[0, 0]
+            x[:, 0] += values[0]
             parts.append((x, *rests))
         x, rough, fine = (np.concatenate(part, axis=-1) if part[1:] else part[0] for part in zip(*parts))
         flat = x.reshape(-1, x.shape[2])
         flat -= (flat @ still) @ still.T
+        return x, np.linalg.norm(rough, axis=1), np.linalg.norm(fine, axis=1)
+
+    def bounds(self, boxes: Array) -> tuple[Array, Array, Array]:
+        """Return lower bounds (B,) on V over boxes (B, 2 d), V at their middles, and the effects (B, d) of halves."""
+        h, slowest = np.diff(_ends(boxes))[:, :, 0] / 2, np.exp(_ends(boxes)[:, :-1].mean(axis=2).max(axis=1))
+        plain = np.column_stack([h[:, :-1], h[:, -1] / np.maximum(slowest, 1.0)])
+        if self.cone is not None:
+            return self._cone_bounds(boxes, h, plain)
+        _, y = self.record
+        x, rough, rest = self._courses(boxes, np.ones(1))
         gram, side, energy = np.einsum("bin,bjn->bij", x, x), x @ y, float(y @ y)
         sizes = np.sqrt(np.einsum("bii->bi", gram))
-        length, h = sizes[:, 0], np.diff(_ends(boxes))[:, :, 0] / 2
+        length, effects = sizes[:, 0], h * sizes[:, 1:]
         middle = energy - np.where(length > 0, side[:, 0] / np.where(length > 0, length, 1.0), 0.0) ** 2
-        effects, rest = h * sizes[:, 1:], np.linalg.norm(fine, axis=1)
         tangent = energy - most_explained(gram, side, h)
         lower = np.zeros(len(boxes))
-        for least, away, moved in ((middle, np.linalg.norm(rough, axis=1), 0.0), (tangent, rest, effects.sum(axis=1))):
+        for least, away, moved in ((middle, rough, 0.0), (tangent, rest, effects.sum(axis=1))):
             shortest = length - away - moved  # of x anywhere in the box
             known = shortest > 0
             largest = np.sqrt(energy) / shortest[known]  # of the gain
             found = np.sqrt(np.maximum(least[known], 0.0)) - largest * away[known]
             lower[known] = np.maximum(lower[known], np.maximum(found, 0.0) ** 2)
-        slowest = np.exp(_ends(boxes)[:, :-1].mean(axis=2).max(axis=1))
-        plain = np.column_stack([h[:, :-1], h[:, -1] / slowest])
         return lower, middle, np.where((rest + effects.sum(axis=1) < 2 * length)[:, None], effects, plain)
+
+    def _cone_bounds(self, boxes: Array, h: Array, plain: Array) -> tuple[Array, Array, Array]:
+        """Return `bounds` over boxes with half widths (B, d) within the cone; effects are plain in large boxes."""
+        y = self.record[1]
+        x, rough, fine = map(np.array, zip(*(self._courses(boxes, one) for one in self.cone.T)))
+        lower, middle = np.zeros((2, len(boxes)))
+        corners = np.array([(1, *signs) for signs in product((-1, 1), repeat=h.shape[1])])
+        for b, half in enumerate(h):
+            bounds, still = [0.0], x[:, b, 0].T
+            middle[b] = np.sum((y - still @ _nonnegative(still, y)) ** 2)
+            if np.isfinite(rough[:, b]).all():
+                bounds.append(least_from_cone(still, rough[:, b], y))
+            if np.isfinite(fine[:, b]).all():
+                rays = (corners * [1.0, *half]) @ x[:, b]
+                bounds.append(least_from_cone(rays.reshape(-1, len(y)).T, fine[:, b].repeat(len(corners)), y))
+            lower[b] = max(bounds) ** 2
+        sizes = np.linalg.norm(x, axis=(0, 3))
+        effects = h * sizes[:, 1:]
+        small = np.linalg.norm(fine, axis=0) + effects.sum(axis=1) < 2 * sizes[:, 0]
+        return lower, middle, np.where(small[:, None], effects, plain)
 
     def search(self, value: float, gap: float, seconds: float, most: float = np.inf) -> Search:
         """Discard boxes whose bound lies above (1 - gap) times a value, or times a better one found on the way.
@@ -192,7 +267,10 @@ class BranchAndBound:
 
     def certify(self, value: float) -> Bound:
         """Return the lower bound on V within the box for a point with this value."""
-        if self.work > MOST[len(self.box.low)]:
+        if self.cone is not None and self.cone.shape[1] > FEW:
+            return Bound.none(f"{self.cone.shape[1]} increments of the static curve: a proof would take too long with "
+                              f"more than {FEW}; several starts are compared")
+        if self.work * (1 if self.cone is None else self.cone.shape[1]) > MOST[len(self.box.low)]:
             return Bound.none(f"{self.work:.1e} pairs of a sample and a move of the input: a proof would take too "
                               "long; several starts are compared")
         begun = time.thread_time()
@@ -221,15 +299,14 @@ def _ends(boxes: Array) -> Array:
 
 
 def applies(errors: ProcessErrors) -> bool:
-    """Whether a lower bound is known: one or two real poles with dead time, straight f, held input, start at rest."""
+    """Whether a lower bound is known for the dynamics: one or two real poles with dead time, held input, at rest."""
     u = errors.unknowns
-    return (u.structures in ((ProcessStructure(1),), (ProcessStructure(2),)) and errors.is_line(0) and not u.free
-            and not errors.straight)
+    return u.structures in ((ProcessStructure(1),), (ProcessStructure(2),)) and not u.free and not errors.straight
 
 
 def better_start(errors: ProcessErrors, box: ProcessBox, value: float) -> Array | None:
     """Return a point (log tau, theta) with a smaller sum of squares than a value, where a coarse search finds one."""
-    if not applies(errors) or len(box.low) > 2:  # where it would take longer than all descents
+    if not (applies(errors) and errors.is_line(0)) or len(box.low) > 2:  # where it would take longer than all descents
         return None
     bound = BranchAndBound(errors, box)
     if bound.work > WORK / LEAST:
@@ -238,9 +315,9 @@ def better_start(errors: ProcessErrors, box: ProcessBox, value: float) -> Array 
     return found.point if found.best < value * (1 - GAP) else None
 
 
-def certify(best: ProcessPoint, box: ProcessBox) -> Bound:
-    """Bound the errors of a fit within a box from below, in units of the record, where there is a method."""
-    if not applies(best.errors):
+def certify(errors: ProcessErrors, value: float, box: ProcessBox, cone: Array | None = None) -> Bound:
+    """Bound the errors of a fit of a value within a box from below, in units of the record, where there is a method."""
+    if not applies(errors) or cone is None and not errors.is_line(0):
         return Bound.none(REASON)
-    found = BranchAndBound(best.errors, box).certify(best.value)
-    return replace(found, value=best.errors.unit * found.value)
+    found = BranchAndBound(errors, box, cone).certify(value)
+    return replace(found, value=errors.unit * found.value)
