@@ -85,11 +85,11 @@ process.takes_any_times = True
 
 def _problem(errors: ProcessErrors, x: Array) -> Problem:
     """Minimise ‖e‖² over the numbers of all processes, the static curves and the levels."""
-    places, data = errors.variables, errors.data
+    variables, data = errors.variables, errors.data
     return Problem(
         "process.exact",
-        start=places.values(x),
-        terms=(Errors(places.squares, places.value, errors),),
+        start=variables.values(x),
+        terms=(Errors(variables.squares, variables.value, errors),),
         further=partial(_signals, errors), model=errors.model,
         facts={"iterate": True, "channels": data.inputs, "outputs": data.outputs,
                "bases": dict(zip(data.inputs, errors.outer_bases))},

@@ -112,16 +112,11 @@ class ProcessErrors(Criterion):
                              units=replace(u, y_scale=u.y_scale[o : o + 1], y_offset=u.y_offset[o : o + 1]))
                      for o, name in enumerate(self.data.outputs))
 
-    @cached_property
-    def places(self) -> list[NDArray[np.intp]]:
-        """Places in x of the unknowns of every output alone."""
-        return [self.unknowns.of_output(o)[1] for o in range(self.unknowns.outputs)]
-
     def join(self, parts: list[Array]) -> Array:
         """Return x of the unknowns of every output."""
         x = np.zeros(self.unknowns.size)
-        for places, part in zip(self.places, parts):
-            x[places] = part
+        for o, part in enumerate(parts):
+            x[self.unknowns.of_output(o)[1]] = part
         return x
 
     # -- the record --------------------------------------------------------------------------------------------------

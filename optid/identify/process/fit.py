@@ -131,7 +131,7 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[ProcessErrors, Array], 
         at = errors.variables.pack(end.values or {})
         ends.append((excess(within, at) > INSIDE, end.objective, at))
     evidence = yield from fit.confirm(min(ends, key=lambda one: one[:2])[2], figures)
-    if evidence is None or cone is None:
+    if evidence is None or cone is None or not np.isfinite(evidence.objective):
         return evidence
     return replace(evidence, bound=partial(certify, errors, evidence.objective / errors.unit, boxes[0], cone))
 
@@ -207,8 +207,8 @@ def read_boxes(problem: Problem, errors: ProcessErrors, boxes: Sequence[ProcessB
     Raises:
         InfeasibleError: a number is bounded to values that are not tried.
     """
-    low, high = (np.concatenate(ends) for ends in zip(*((box.low, box.high) for box in boxes)))
-    usual = low.copy(), high.copy()
+    usual = _ends(boxes)
+    low, high = usual[0].copy(), usual[1].copy()
     others, every = list[tuple[str, Array, float]](), np.arange(problem.space.size)
     places = np.concatenate([every[problem.space.places[errors.key("dynamics", p)]]
                              for p in range(len(errors.unknowns.pairs))])
@@ -225,8 +225,10 @@ def read_boxes(problem: Problem, errors: ProcessErrors, boxes: Sequence[ProcessB
                 high[j] = min(high[j], end)
             if one.cone == "zero" or row[used[0]] < 0:
                 low[j] = max(low[j], end)
-    for j in np.flatnonzero((low > usual[1]) | (high < usual[0])):
-        _refuse_untried(errors, int(j), *(float(end[j]) for end in usual))
+    untried = np.flatnonzero((low > usual[1]) | (high < usual[0]))
+    if untried.size:
+        _refuse_untried(errors, int(untried[0]), *(float(end[untried[0]]) for end in usual))
+    if np.any(low > high):
         return boxes, False, None
     edges = np.cumsum([len(box.low) for box in boxes])[:-1]
     found = [ProcessBox(*ends) for ends in zip(np.split(low, edges), np.split(high, edges))]
@@ -252,17 +254,15 @@ def _numbers(errors: ProcessErrors, view: Any) -> cp.Expression:
     return cp.hstack([view.inner[errors.key("dynamics", p)] for p in range(len(errors.unknowns.pairs))])
 
 
-def _usual(errors: ProcessErrors) -> tuple[Array, Array]:
-    """Return the usual bounds of the numbers of all outputs."""
-    low, high = (np.concatenate(ends) for ends in zip(*((box.low, box.high) for box in map(usual_box, errors.each))))
-    return low, high
+def _ends(boxes: Sequence[ProcessBox]) -> tuple[Array, Array]:
+    """Return the bounds of the numbers of all outputs one after another."""
+    return np.concatenate([box.low for box in boxes]), np.concatenate([box.high for box in boxes])
 
 
 def _cell(errors: ProcessErrors, view: Any) -> dict[str, Any]:
     """Keep every dead time in its cell about the point where the constraints are read, other numbers at usual sizes."""
-    places = errors.variables
-    x = places.pack({name: view.reference[name] for name in places.names})
-    low, high = _usual(errors)
+    x = errors.variables.pack({name: view.reference[name] for name in errors.variables.names})
+    low, high = _ends([*map(usual_box, errors.each)])
     for p, place in errors.unknowns.delays.items():
         low[place], high[place] = errors.cell(x, p)
     numbers = _numbers(errors, view)
@@ -271,7 +271,7 @@ def _cell(errors: ProcessErrors, view: Any) -> dict[str, Any]:
 
 def _at_bounds(errors: ProcessErrors, x: Array, late: float) -> list[tuple[str, int, float, float]]:
     """Return (variable, entry, sign, bound) of numbers at their usual bounds, and of dead times up to a late one."""
-    found, (low, high) = [], _usual(errors)
+    found, (low, high) = [], _ends([*map(usual_box, errors.each)])
     for value, (p, name), least, most in zip(x[errors.unknowns.dynamic], errors.unknowns.numbers, low, high):
         there = errors.key("dynamics", p), errors.unknowns.structures[p].names.index(name)
         if value <= least + (late if name == "dead_time" else NEAR):

@@ -19,7 +19,7 @@ from optid.identify.process.separation import TAUS
 LONGEST = 5_000  # outputs up to which profiles are worth their time; with more of them errors are all but quadratic
 DOUBLINGS = 30  # of the step towards the end of an interval
 EXACT = 1e-4  # of the width of an interval, to which its ends are found
-QUADRATIC = ("T", "tau_zero")  # parameters whose standard errors do
+QUADRATIC = ("T", "tau_zero")  # parameters of which standard errors say enough
 WIDE = 0.5  # standard error of the logarithm of a time constant from which on errors are not quadratic in it
 
 
