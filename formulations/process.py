@@ -11,10 +11,11 @@ Starts from a grid descend in the dynamics, everything linear projected out, fro
 
     minimise ‖r‖² + remainder    subject to    r = R (z - z0) + e0,  the user's constraints,  dead times in their cells,
 
-confirm it. For one time constant with dead time and a straight f branch and bound proves that no other optimum is
-better. Constraints are stated in ``log tau``, ``log T``, ``log zeta``, ``tau_zero``, ``dead_time``, ``K``, ``mu`` and
-``Theta`` (a column), with several inputs as in ``K[valve]``; see `formulations.constraints.process`. Several outputs,
-each divided by its standard deviation, have processes of their own, ``K[level,valve]``, and are searched one by one.
+confirm it. For one time constant or two with dead time, and a straight f or a monotone one of few increments, branch
+and bound proves that no other optimum is better. Constraints are stated in ``log tau``, ``log T``, ``log zeta``,
+``tau_zero``, ``dead_time``, ``K``, ``mu`` and ``Theta`` (a column), with several inputs as in ``K[valve]``; see
+`formulations.constraints.process`. Several outputs, each divided by its standard deviation, have processes of their
+own, ``K[level,valve]``, and are searched one by one.
 """
 
 from collections.abc import Mapping, Sequence

@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +95,7 @@ def least_from_cone(rays: Array, rest: Array, y: Array) -> float:
         rest: (k,) sizes.
         y: (rows,).
     """
-    triangle = np.linalg.qr(np.column_stack([rays, y]), mode="r")
+    triangle: Any = np.linalg.qr(np.column_stack([rays, y]), mode="r")
     rays, y = triangle[:, :-1], triangle[:, -1]
     c = _nonnegative(rays, y)
     dual = y - rays @ c
@@ -172,7 +173,7 @@ class BranchAndBound:
         h, slowest = np.diff(_ends(boxes))[:, :, 0] / 2, np.exp(_ends(boxes)[:, :-1].mean(axis=2).max(axis=1))
         plain = np.column_stack([h[:, :-1], h[:, -1] / np.maximum(slowest, 1.0)])
         if self.cone is not None:
-            return self._cone_bounds(boxes, h, plain)
+            return self._cone_bounds(self.cone, boxes, h, plain)
         _, y = self.record
         x, rough, rest = self._courses(boxes, np.ones(1))
         gram, side, energy = np.einsum("bin,bjn->bij", x, x), x @ y, float(y @ y)
@@ -189,10 +190,10 @@ class BranchAndBound:
             lower[known] = np.maximum(lower[known], np.maximum(found, 0.0) ** 2)
         return lower, middle, np.where((rest + effects.sum(axis=1) < 2 * length)[:, None], effects, plain)
 
-    def _cone_bounds(self, boxes: Array, h: Array, plain: Array) -> tuple[Array, Array, Array]:
+    def _cone_bounds(self, cone: Array, boxes: Array, h: Array, plain: Array) -> tuple[Array, Array, Array]:
         """Return `bounds` over boxes with half widths (B, d) within the cone; effects are plain in large boxes."""
         y = self.record[1]
-        x, rough, fine = map(np.array, zip(*(self._courses(boxes, one) for one in self.cone.T)))
+        x, rough, fine = map(np.array, zip(*(self._courses(boxes, one) for one in cone.T)))
         lower, middle = np.zeros((2, len(boxes)))
         corners = np.array([(1, *signs) for signs in product((-1, 1), repeat=h.shape[1])])
         for b, half in enumerate(h):
