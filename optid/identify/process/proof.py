@@ -37,6 +37,7 @@ MOST = {2: 5e6, 3: 1e3}  # responses to single moves in one bound beyond which n
 BATCH, ENTRIES = 2000, 200_000  # boxes that are bounded together, and entries of their courses
 RIDGE = 1e-13  # of scaled normal equations, for columns that are all but parallel
 FEW = 4  # increments of a static curve up to which a proof is tried
+RAMP = 10.0  # of so many parts of a record one is the longest time that a dead time is compared with
 MOVED, FURTHER = 8, 1.05  # times that errors are moved until they bound, and how far beyond
 ROUNDING = 1e-9  # of the conditions that they then obey, relative to their size
 METHOD = "branch and bound over time constants and dead time"
@@ -171,7 +172,7 @@ class BranchAndBound:
     def bounds(self, boxes: Array) -> tuple[Array, Array, Array]:
         """Return lower bounds (B,) on V over boxes (B, 2 d), V at their middles, and the effects (B, d) of halves."""
         h, slowest = np.diff(_ends(boxes))[:, :, 0] / 2, np.exp(_ends(boxes)[:, :-1].mean(axis=2).max(axis=1))
-        plain = np.column_stack([h[:, :-1], h[:, -1] / np.maximum(slowest, 1.0)])
+        plain = np.column_stack([h[:, :-1], h[:, -1] / np.clip(slowest, 1.0, max(self.errors.length / RAMP, 1.0))])
         if self.cone is not None:
             return self._cone_bounds(self.cone, boxes, h, plain)
         _, y = self.record
