@@ -198,10 +198,9 @@ class BranchAndBound:
         lower, middle = np.zeros((2, len(boxes)))
         corners = np.array([(1, *signs) for signs in product((-1, 1), repeat=h.shape[1])])
         for b, half in enumerate(h):
-            bounds, still = [0.0], x[:, b, 0].T
+            still = x[:, b, 0].T
             middle[b] = np.sum((y - still @ _nonnegative(still, y)) ** 2)
-            if np.isfinite(rough[:, b]).all():
-                bounds.append(least_from_cone(still, rough[:, b], y))
+            bounds = [least_from_cone(still, rough[:, b], y)]
             if np.isfinite(fine[:, b]).all():
                 rays = (corners * [1.0, *half]) @ x[:, b]
                 bounds.append(least_from_cone(rays.reshape(-1, len(y)).T, fine[:, b].repeat(len(corners)), y))

@@ -58,16 +58,15 @@ def one_pole_courses(boxes, smooth, t, s, w):
                 za, zb = max(since - h2, 0.0) / high_tau, (since + h2) / low_tau
                 decay, slow = _decay(z), _decay(za)
                 x0 += w[j] * (1 - decay)
-                if not smooth[i]:
-                    wide += size * max(decay - _decay(zb), slow - decay)
-                elif since > 0.0:
+                wide += size * max(decay - _decay(zb), slow - decay)
+                if smooth[i] and since > 0.0:
                     x1 -= w[j] * z * decay
                     x2 -= w[j] * decay / tau
                     m = max(abs(1 - za), abs(1 - zb))
                     rest += size * slow * (h1 * h1 / 2 * zb * m + h1 * h2 * m / low_tau
                                            + h2 * h2 / (2 * low_tau * low_tau))
             x[i, 0, k], x[i, 1, k], x[i, 2, k] = x0, x1, x2
-            rough[i, k] = np.inf if smooth[i] else wide
+            rough[i, k] = wide
             fine[i, k] = rest if smooth[i] else np.inf
     return x, rough, fine
 
