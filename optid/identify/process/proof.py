@@ -76,17 +76,8 @@ def most_explained(gram: Array, side: Array, h: Array) -> Array:
     return best
 
 
-def _nonnegative(columns: Array, y: Array) -> Array:
-    """Return the non-negative coefficients of columns (rows, k) that explain most of y; zeros where none are found."""
-    from scipy.optimize import nnls
-
-    with suppress(RuntimeError):  # too many steps
-        return nnls(columns, y)[0]
-    return np.zeros(columns.shape[1])
-
-
-def least_from_cone(rays: Array, rest: Array, y: Array) -> float:
-    """Return a lower bound on |y - sum c_j (ray_j + e_j)| over c >= 0 and all e_j no larger than their rest.
+def least_from_cone(rays: Array, rest: Array, y: Array) -> tuple[float, float]:
+    """Return |y - sum c_j ray_j| at its least over c >= 0, and a bound on it with ray_j + e_j, |e_j| <= rest_j.
 
     Any l with rays' l <= -rest |l| gives the bound l'y / |l|: here the errors of non-negative least squares, moved
     until they obey.
@@ -96,18 +87,22 @@ def least_from_cone(rays: Array, rest: Array, y: Array) -> float:
         rest: (k,) sizes.
         y: (rows,).
     """
+    from scipy.optimize import nnls
+
     triangle: Any = np.linalg.qr(np.column_stack([rays, y]), mode="r")
     rays, y = triangle[:, :-1], triangle[:, -1]
-    c = _nonnegative(rays, y)
-    dual = y - rays @ c
+    dual = y
+    with suppress(RuntimeError):  # too many steps: any dual serves
+        dual = y - rays @ nnls(rays, y)[0]
+    least, held = float(np.linalg.norm(dual)), np.zeros(rest.size, dtype=bool)
     for _ in range(MOVED):
         size = float(np.linalg.norm(dual))
         excess = rays.T @ dual + rest * size
         if np.all(excess <= ROUNDING * size):
-            return max(float(dual @ y), 0.0) / size if size else 0.0
-        held = (c > 0) | (excess > 0)
+            return least, max(float(dual @ y), 0.0) / size if size else 0.0
+        held |= excess > 0
         dual = dual - np.linalg.lstsq(rays[:, held].T, FURTHER * np.maximum(excess[held], 0.0), rcond=1e-12)[0]
-    return 0.0
+    return least, 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,17 +193,14 @@ class BranchAndBound:
         lower, middle = np.zeros((2, len(boxes)))
         corners = np.array([(1, *signs) for signs in product((-1, 1), repeat=h.shape[1])])
         for b, half in enumerate(h):
-            still = x[:, b, 0].T
-            middle[b] = np.sum((y - still @ _nonnegative(still, y)) ** 2)
-            bounds = [least_from_cone(still, rough[:, b], y)]
+            middle[b], lower[b] = least_from_cone(x[:, b, 0].T, rough[:, b], y)
             if np.isfinite(fine[:, b]).all():
-                rays = (corners * [1.0, *half]) @ x[:, b]
-                bounds.append(least_from_cone(rays.reshape(-1, len(y)).T, fine[:, b].repeat(len(corners)), y))
-            lower[b] = max(bounds) ** 2
+                rays = ((corners * [1.0, *half]) @ x[:, b]).reshape(-1, len(y)).T
+                lower[b] = max(lower[b], least_from_cone(rays, fine[:, b].repeat(len(corners)), y)[1])
         sizes = np.linalg.norm(x, axis=(0, 3))
         effects = h * sizes[:, 1:]
         small = np.linalg.norm(fine, axis=0) + effects.sum(axis=1) < 2 * sizes[:, 0]
-        return lower, middle, np.where(small[:, None], effects, plain)
+        return lower**2, middle**2, np.where(small[:, None], effects, plain)
 
     def search(self, value: float, gap: float, seconds: float, most: float = np.inf) -> Search:
         """Discard boxes whose bound lies above (1 - gap) times a value, or times a better one found on the way.
