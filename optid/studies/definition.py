@@ -389,7 +389,8 @@ def _solver_axis(value: Any) -> list[Any]:
 
 Formulations = Annotated[
     tuple[Annotated[tuple[FormulationEntry, ...], PlainValidator(_formulations_of)], ...],
-    AfterValidator(lambda several: sum(several, ())), AfterValidator(_distinct_labels), BeforeValidator(_formulation_axis)]
+    AfterValidator(lambda several: sum(several, ())), AfterValidator(_distinct_labels),
+    BeforeValidator(_formulation_axis)]
 
 
 @dataclass(frozen=True, config=ConfigDict(arbitrary_types_allowed=True))
@@ -415,8 +416,8 @@ class Definition:
 
 WORDS = {"a valid number": "a number", "a valid integer": "an integer", "a valid boolean": "true or false",
          "a valid dictionary": "a table", "a valid string": "a text",
-         "a dictionary or an instance of DataEntry": "a record, optid.Data(u, y, dt), the name of a file or of a simulated "
-         "system, or a table of keys",
+         "a dictionary or an instance of DataEntry": "a record, optid.Data(u, y, dt), the name of a file or of a "
+         "simulated system, or a table of keys",
          "a dictionary or an instance of FormulationEntry": "a table of keys with the name of a formulation",
          "a dictionary or an instance of SolverEntry": "the name of a solver, or a table of keys"}
 """Words of pydantic, and ours."""
