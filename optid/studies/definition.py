@@ -388,7 +388,7 @@ def _solver_axis(value: Any) -> list[Any]:
 
 
 Formulations = Annotated[
-    tuple[Annotated[tuple[FormulationEntry, ...], PlainValidator(_formulations_of)], ...],
+    tuple[Annotated[Any, PlainValidator(_formulations_of)], ...],
     AfterValidator(lambda several: sum(several, ())), AfterValidator(_distinct_labels),
     BeforeValidator(_formulation_axis)]
 
