@@ -278,7 +278,7 @@ def test_refusals(data, arguments, error, text):
 
 def test_nearly_linear_feedback_is_refused_or_warned_of():
     data = broken(lambda u, y: (u, 1e-4 * y))
-    with pytest.raises(RankError, match="cannot be told from an output injection"):
+    with pytest.raises(RankError, match="cannot be distinguished from an output injection"):
         optid.fit(data, "hammerstein_ss.asivid", nx=3, basis=F, feedback_basis=[G[0], None])
     small = broken(lambda u, y: (u, 0.02 * y))
     with pytest.warns(DataWarning, match="nearly linear"):
