@@ -10,7 +10,7 @@ from rich.text import Text
 from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
 from optid.cli.results import check_folders, check_names, command_line
-from optid.cli.studies import NOTHING_SOLVED, Workers, follow_progress
+from optid.cli.studies import NOTHING_SOLVED, follow_progress
 from optid.cli.terminal import note, print_table, print_text
 from optid.descriptions import describe
 from optid.lazy import import_cvxpy
@@ -23,7 +23,7 @@ ASSUMED = {"na": 2, "nb": 2, "nc": 1, "nd": 1, "nx": 2, "basis": "triangular:8"}
 def compare(data: Paths = None, example: str | None = None, *, how: dict[str, Any], formulation: str = DEFAULT,
             constraint: Words = None, settings: Words = None, solvers: Words = None, accuracy: float = 1e-8,
             time_limit: float = 60.0, memory_limit: float = 2000.0, repetitions: int = 3, holdout: float = 0.3,
-            seed: int = 0, db: File = None, workers: Workers = 1, accept_changed_data: bool = False, report: File = None
+            seed: int = 0, db: File = None, workers: int = 1, accept_changed_data: bool = False, report: File = None
             ) -> None:
     """Compare solvers on one record at equal verified accuracy and recommend one.
 
@@ -42,6 +42,7 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
         memory_limit (MB): Memory limit of a run.
     The study:
         repetitions: Runs of each solver; the median time is reported.
+        workers (--workers -w N): Number of worker processes; times are most exact with one.
         db (FILE): Keep the results in this database, and resume from it.
     """
     check_names(constraint, formulation=formulation)

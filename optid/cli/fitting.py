@@ -95,14 +95,15 @@ def identify(data: Paths = None, example: str | None = None, *, how: dict[str, A
     Example: optid identify data.csv --inputs u --outputs y --dt 0.1 --report report.html
 
     The model:
-        effort (WORD): small, normal, large, or units of about a CPU second; the same trials on every machine.
-        budget (SECONDS): Stop after so much CPU time, wherever the search is. [dim]none[/]
+        effort (WORD): small, normal, large, or a number of units of about one CPU second. Every machine runs the same
+            trials.
+        budget (SECONDS): Stop the search after this CPU time. [dim]none[/]
         horizon (N): Compare N-step-ahead predictions. [dim]simulation[/]
         classes (NAME...): Model classes: linear, 'input functions', feedback, 'latent signals'. [dim]all[/]
         constraint (-c NAME:VALUE...): Constraint on every model; optid constraints lists them.
     The solver:
         workers (N): Number of processes. [dim]one per core[/]
-        trials (FILE): Keep finished trials in this file; a search that was stopped goes on from it.
+        trials (FILE): Keep finished trials in this file; a stopped search resumes from it.
     The record:
         split (SHARE): Search on this share of the record and validate on the rest.
     """

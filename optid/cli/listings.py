@@ -68,8 +68,8 @@ def constraints() -> None:
             rows.append((Text(name, "bold"), _arguments(found), found.summary))
     print_table("Constraints", ("constraint", "arguments", "meaning"), rows,
                 "Use one with --constraint NAME:VALUE or NAME:VALUE,KEY=VALUE. Arguments in brackets are optional. "
-                "What is said of an interval holds everywhere on it; of sines, cosines, own functions at 201 points. "
-                "Bounds hold to 1e-6 of what they bound, the accuracy of the programmes of a fit.")
+                "A constraint on an interval holds everywhere on it; for sines, cosines and user functions, at 201 "
+                "points of it. Bounds hold to 1e-6, relative, the accuracy of the programmes of a fit.")
 
 
 def examples() -> None:

@@ -65,13 +65,13 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
         healthy (FILE...): A later healthy record, from which noise and thresholds are calibrated.
         thresholds (FILE): Read the thresholds from this file (.json), or write them if it does not exist.
         extrapolate: Allow thresholds extrapolated beyond the simulated run lengths.
-        drift (HOURS): Follow disturbances that change over so many hours, such as a season; slower faults stay hidden.
-        adapt (FACTOR): Multiply the thresholds by this factor at most where the noise has another colour.
+        drift (HOURS): Follow disturbances that change over this many hours, such as seasons; slower faults stay hidden.
+        adapt (FACTOR): Multiply the thresholds by at most this factor where the noise has another colour.
         seed: Seed of the simulated thresholds.
     The operator (the state of a stopped monitor):
         ack: Acknowledge the alarm: discard it and go on.
         rebase: Take a new baseline after a repair: discard the alarm and all carried faults.
-        maintenance: Count the rows without a search.
+        maintenance: Count the rows of a maintenance period, without a search for faults.
     The result:
         state (FILE): Resume from this state (.npz) if it exists, and save the state to it.
         lines (--json): Print one JSON object per line.

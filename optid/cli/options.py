@@ -33,7 +33,7 @@ The record:
     inputs (-u NAME...): Columns of the inputs. [dim]u, u1, u2, ...[/]
     outputs (-y NAME...): Columns of the outputs. [dim]y, y1, y2, ...[/]
     dt: Sampling time. [dim]from the time stamps[/]
-    time (NAME): Column of time stamps; 'none' ignores them. [dim]one named as a clock, or of dates[/]
+    time (NAME): Column of time stamps; 'none' ignores them. [dim]a column named like a clock, or with dates[/]
     experiment (NAME): Column that names the experiment of each row.
     columns (NAME...): Names of the columns of a file without a header.
     input_units (UNIT...): One unit per input.

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.text import Text
@@ -20,13 +20,7 @@ study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich
 
 NOTHING_SOLVED = 4  # exit code of a run in which no cell has an answer, as where one fit fails in its solver
 
-Workers = Annotated[
-    int | None,
-    typer.Option("--workers", "-w", metavar="N", min=1, help="Number of worker processes; one per core by default."),
-]
-
-
-def run(file: File = None, example: bool = False, db: File = None, workers: Workers = None,
+def run(file: File = None, example: bool = False, db: File = None, workers: int | None = None,
         scheduler: str | None = None, accept_changed_data: bool = False, retry: Words = None, export: File = None,
         dry_run: bool = False) -> None:
     """Run a study, or resume an interrupted one.
@@ -38,6 +32,7 @@ def run(file: File = None, example: bool = False, db: File = None, workers: Work
     Options:
         example: Run a built-in study, which takes half a minute.
         db (FILE): Database of the results. [dim]name of the study file with .sqlite[/]
+        workers (--workers -w N): Number of worker processes. [dim]one per core[/]
         scheduler (ADDRESS): Run on a Dask cluster (tcp://host:8786).
         retry (OUTCOME...): Rerun the cells with these outcomes, such as 'time limit'.
         export (FILE): Write the results at the end (.parquet, .csv).

@@ -101,8 +101,8 @@ def read_times(times: Any, counts: Sequence[int], dt: float | None
             k = int(np.argmax(steps <= 0)) + 1
             word = "runs backwards" if steps[k - 1] < 0 else "stands still"
             raise DataError(f"{where}the time {word} at sample {k} ({t[k - 1]}, then {t[k]}; "
-                            f"{int(np.sum(steps <= 0))} such samples in all). Sort the record by time and drop what "
-                            "stands twice")
+                            f"{int(np.sum(steps <= 0))} such samples in all). Sort the record by time and drop "
+                            "duplicate times")
         kinds.add(dated)
         starts.append(float(t[0].astype("M8[us]").astype(np.int64)) / 1e6 if dated else float(t[0]))
         found.append(later)

@@ -162,7 +162,7 @@ def with_notes(found: Any, fit: Any, data: Any) -> Any:
         notes += [f"The intervals do not account for extrapolation: {one}."
                   for one in list_outside("input", fit.model.inputs[place], share, f.basis)]
     if fit.model.levels is not None:
-        notes.append("Every experiment of the fit has a constant of its own: the intervals do not account for that of "
+        notes.append("Every experiment of the fit has its own constant: the intervals do not account for that of "
                      "another record.")
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=3)

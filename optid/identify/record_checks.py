@@ -129,7 +129,7 @@ def _sentences(check: Check) -> list[str]:
 
 def _warned(found: list[str]) -> list[str]:
     for sentence in found:
-        warnings.warn(sentence, DataWarning, stacklevel=5)
+        warnings.warn(sentence, DataWarning, stacklevel=6)
     return found
 
 

@@ -108,7 +108,7 @@ def _fractional_delay(A: Array, B: Array, C: Array, excess: float, dt: float, ch
         raise StructureError(
             f"B of input {channel!r} has one coefficient more than a dead time of whole samples allows, and "
             f"{'more than one' if len(changes) + len(exact) else 'no'} dead time within a sampling time explains it: "
-            "what is left is a pole at 0, which is a delay and has no logarithm. Choose nb <= na, or another nk.")
+            "the remainder is a pole at 0, which is a delay and has no logarithm. Choose nb <= na, or another nk.")
     if len(exact):
         return float(grid[exact[0]])
     from scipy.optimize import brentq

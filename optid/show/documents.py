@@ -203,7 +203,7 @@ def _fit_charts(fit: "Fit", curves: Curves) -> list[Any]:
 
 def _validations(fit: "Fit", test: Data | None) -> list[Any]:
     parts: list[Any] = []
-    for title, record in (("Estimation record", fit.data), ("Test record, not seen by the fit", test)):
+    for title, record in (("Estimation record", fit.data), ("Test record, not used by the fit", test)):
         if isinstance(record, Data):
             parts += [Heading(title), *attempt("The validation", partial(_validation, fit.model, record))]
             if record is test:

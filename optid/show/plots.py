@@ -279,7 +279,7 @@ def _time_panels(figure: Any, fit: "Fit", record: Data, title: str, closeup: boo
     several = f", experiments 1-{len(shown)} of {record.n_experiments}" if record.n_experiments > 1 else ""
     axes[0, 0].set_title(f"Fit over time: {title}{several}")
     # outside the layout, where it would widen its column
-    place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 3, "borderaxespad": 0.2}
+    place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 4, "borderaxespad": 0.2}
     axes[0, -1].legend(**place, handlelength=1.6).set_in_layout(False)
 
 

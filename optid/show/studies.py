@@ -28,10 +28,10 @@ COUNTED = (
     ("Solved", "the run was completed, our own residuals are within the tolerance of the compared accuracy, and no "
      "other solver verified a lower objective. Of several repetitions every one must count."),
     ("Problem", "one record with one formulation: what every solver was given alike."),
-    ("First", "who solved fewer problems than the most reliable, by more than 1 % of them and beyond chance, is no "
-     "candidate. The first is a candidate that no other one beats in time where both work. Others tie with it where "
-     "the 95 % interval of the ratio of their times holds 1 or the difference is below 10 %. With fewer than 6 "
-     "problems in common, or an interval wider than a factor of 2, it cannot be told."),
+    ("First", "a solver is no candidate if it solved fewer problems than the most reliable one, by more than 1 % of "
+     "them and beyond chance. The first is the candidate that no other candidate beats in time on common problems. "
+     "Others tie with it if the 95 % interval of the ratio of their times contains 1 or the difference is below 10 %. "
+     "With fewer than 6 common problems, or an interval wider than a factor of 2, the comparison cannot tell."),
     ("Models", "compare by their fit on unseen samples, record by record, each formulation with the model of its best "
      "verified objective. Of two to five data sets each is judged by its own records; from six on each counts once."),
     ("Profile", "share of the problems solved within a factor of the fastest time (Dolan and Moré, 2002)."),
@@ -116,7 +116,7 @@ def _formulations(verdict: StudyVerdict) -> list[Any]:
              f"{one.standing(one.choice.first).solved:,} of {len(one.found.data):,}")
             for one in verdict.sections if one.choice.decided]
     rest = len(verdict.sections) - len(rows)
-    note = f"For {plural(rest, 'formulation')} it cannot be told." if rest else ""
+    note = f"For {plural(rest, 'formulation')} the comparison cannot tell." if rest else ""
     folds = [Fold(one.name, [solver_table(one), Notes([evidence(one)])]) for one in verdict.sections if one.standings]
     return [Table("", ("formulation", "verdict", "solved"), rows, note) if rows else Notes([note]), *folds]
 

@@ -190,8 +190,8 @@ def _orthogonalised(outputs: Sequence[Array], output: int, basis: Basis, names: 
 def _nearly_linear(basis: Basis, name: str, share: float) -> str:
     degree = "" if share < LINEAR else "nearly "
     return (f"the {_family(basis)} feedback functions of output {name!r} are {degree}linear in the outputs on this "
-            f"record: only {share:.1e} of their spread is not. A linear feedback cannot be told from an output "
-            "injection (A - LC, B - LD).")
+            f"record: only {share:.1e} of their spread is not. A linear feedback cannot be distinguished from an "
+            "output injection (A - LC, B - LD).")
 
 
 def _family(basis: Basis) -> str:

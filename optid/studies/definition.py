@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, fields
 from inspect import signature
 from pathlib import Path, PurePath
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import (
@@ -50,8 +50,6 @@ TOP = ("name", "accuracy", "time_limit", "memory_limit", "repetitions", "warm", 
 
 SETTINGS = tuple(p.name for p in signature(solve).parameters.values() if p.kind is not p.VAR_KEYWORD)
 """Arguments of `solve`: as options of a solver they would contradict the rows."""
-
-Entry = TypeVar("Entry")
 
 
 def _plain(value: Any) -> Any:
@@ -308,27 +306,11 @@ class SolverEntry:
 # -- the axes ----------------------------------------------------------------------------------------------------------
 
 
-def _validate_each(model: type[Entry], raw: Sequence[Any], takes: str) -> tuple[Entry, ...]:
-    """Return entries of one kind; all their problems are raised together, by number of the entry."""
-    found: list[Entry] = []
-    problems: list[Problem] = []
-    for i, entry in enumerate(raw):
-        if not isinstance(entry, Mapping | model):
-            problems.append(((i,), f"{_shown(entry)} is invalid: must be {takes}, or a table of keys"))
-            continue
-        try:
-            found.append(TypeAdapter(model).validate_python(entry))
-        except ValidationError as error:
-            problems += [((i, *keys), text) for keys, text in problems_of(error)]
-    refuse(problems)
-    _check_labels(found)
-    return tuple(found)
-
-
-def _check_labels(entries: Sequence[Any]) -> None:
+def _distinct_labels(entries: Any) -> Any:
     names = [entry.name for entry in entries]
     refuse([((i,), f"two entries are called {name!r}; give this one another name = \"...\"")
             for i, name in enumerate(names) if name in names[:i]])
+    return entries
 
 
 def _spread(value: Any, marks: Sequence[str], table: Callable[[Any], Any]) -> list[Any]:
@@ -339,7 +321,8 @@ def _spread(value: Any, marks: Sequence[str], table: Callable[[Any], Any]) -> li
     return [table(entry) for entry in (value if isinstance(value, list | tuple) else [value])]
 
 
-def _data_axis(value: Any) -> tuple[DataEntry, ...]:
+def _data_axis(value: Any) -> list[Any]:
+    """Return the tables of the data entries."""
     def table(entry: Any) -> Any:
         if isinstance(entry, Data):
             return {"record": entry}
@@ -348,37 +331,28 @@ def _data_axis(value: Any) -> tuple[DataEntry, ...]:
             return {"system" if known else "file": str(entry)}
         return entry
 
-    raw = _spread(value, KEYS["data"], table)
-    if not raw:
-        raise ValueError("there is no [[data]]: a study needs at least one")
-    return _validate_each(DataEntry, raw, "a record, optid.Data(u, y, dt), the name of a file or of a simulated system")
+    return _spread(value, KEYS["data"], table) or refuse([((), "there is no [[data]]: a study needs at least one")])
 
 
-def _formulation_axis(value: Any, info: ValidationInfo) -> tuple[FormulationEntry, ...]:
-    """Return the formulations, for each table the grid over its arguments with several values."""
-    raw, data = _spread(value, ("formulation",), lambda entry: entry), info.data.get("data", ())
-    if not raw:
-        raise ValueError("there is no [[formulation]]: a study needs at least one")
-    found: list[FormulationEntry] = []
-    problems: list[Problem] = []
-    for i, table in enumerate(raw):
-        try:
-            several = _grid(table, data) if isinstance(table, Mapping) else [table]
-        except ValidationError as error:
-            problems += [((i, *keys), text) for keys, text in problems_of(error)]
-            continue
-        try:
-            made = _validate_each(FormulationEntry, several, "the name of a formulation")
-        except ValidationError as error:
-            problems += [((i, *keys[1:]), text) for keys, text in problems_of(error)]
-        else:
-            found += made
-            names = [entry.name for entry in data]
-            problems += [((i, "data", k), f"no [[data]] is called {label!r}. {nearest(label, names)}")
-                         for k, label in enumerate(made[0].data) if data and label not in names]
-    refuse(list(dict.fromkeys(problems)))
-    _check_labels(found)
-    return tuple(found)
+def _formulation_axis(value: Any) -> list[Any]:
+    """Return the tables of the formulation entries."""
+    return _spread(value, ("formulation",), lambda entry: entry) or refuse(
+        [((), "there is no [[formulation]]: a study needs at least one")])
+
+
+def _formulations_of(table: Any, info: ValidationInfo) -> tuple[FormulationEntry, ...]:
+    """Return the formulations of a table, one for each point of the grid over its arguments with several values."""
+    data = info.data.get("data", ())
+    several = _grid(table, data) if isinstance(table, Mapping) else [table]
+    try:
+        found = TypeAdapter(tuple[FormulationEntry, ...]).validate_python(several)
+    except ValidationError as error:
+        refuse(list(dict.fromkeys((keys[1:], text) for keys, text in problems_of(error))))
+        raise
+    names = [entry.name for entry in data]
+    refuse([(("data", k), f"no [[data]] is called {label!r}. {nearest(label, names)}")
+            for k, label in enumerate(found[0].data) if data and label not in names])
+    return found
 
 
 def _grid(table: Mapping[str, Any], data: Sequence[DataEntry]) -> list[dict[str, Any]]:
@@ -406,12 +380,17 @@ def installed_solvers() -> list[str]:
     return [name for name, back_end in sorted(back_ends().items()) if back_end.installed]
 
 
-def _solver_axis(value: Any) -> tuple[SolverEntry, ...]:
-    raw = _spread(installed_solvers() if _plain(value) in (ALL, [ALL]) else _plain(value), ("solver",),
-                  lambda entry: {"solver": entry} if isinstance(entry, str) else entry)
-    if not raw:
-        raise ValueError("there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]")
-    return _validate_each(SolverEntry, raw, "the name of a solver")
+def _solver_axis(value: Any) -> list[Any]:
+    """Return the tables of the solver entries."""
+    value = installed_solvers() if _plain(value) in (ALL, [ALL]) else _plain(value)
+    return _spread(value, ("solver",), lambda entry: {"solver": entry} if isinstance(entry, str) else entry) or refuse(
+        [((), "there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]")])
+
+
+Formulations = Annotated[
+    tuple[Annotated[Any, PlainValidator(_formulations_of)], ...],
+    AfterValidator(lambda several: sum(several, ())), AfterValidator(_distinct_labels),
+    BeforeValidator(_formulation_axis)]
 
 
 @dataclass(frozen=True, config=ConfigDict(arbitrary_types_allowed=True))
@@ -419,9 +398,9 @@ class Definition:
     """A grid of data x formulations x solvers x seeds, and the limits that hold for every cell; see `Study`."""
 
     name: Text
-    data: Annotated[Any, PlainValidator(_data_axis)]
-    formulations: Annotated[Any, PlainValidator(_formulation_axis)]
-    solvers: Annotated[Any, PlainValidator(_solver_axis)]
+    data: Annotated[tuple[DataEntry, ...], AfterValidator(_distinct_labels), BeforeValidator(_data_axis)]
+    formulations: Formulations
+    solvers: Annotated[tuple[SolverEntry, ...], AfterValidator(_distinct_labels), BeforeValidator(_solver_axis)]
     accuracy: Annotated[Accuracies, AfterValidator(_not_empty)] = (1e-8,)
     time_limit: Positive = 60.0
     memory_limit: Positive = 2000.0
@@ -436,7 +415,11 @@ class Definition:
 
 
 WORDS = {"a valid number": "a number", "a valid integer": "an integer", "a valid boolean": "true or false",
-         "a valid dictionary": "a table", "a valid string": "a text"}
+         "a valid dictionary": "a table", "a valid string": "a text",
+         "a dictionary or an instance of DataEntry": "a record, optid.Data(u, y, dt), the name of a file or of a "
+         "simulated system, or a table of keys",
+         "a dictionary or an instance of FormulationEntry": "a table of keys with the name of a formulation",
+         "a dictionary or an instance of SolverEntry": "the name of a solver, or a table of keys"}
 """Words of pydantic, and ours."""
 
 

@@ -106,8 +106,9 @@ class Study(Definition):
         study = cls.__new__(cls)
         solvers = [*words, *tables] if isinstance(tables, list) else words
         try:
-            Definition.__init__(study, **{"name": title, **settings}, data=raw.get("data", []), solvers=solvers,
-                                formulations=raw.get("formulation", []), folder=Path(folder))
+            Definition.__init__(study, **{
+                "name": title, **settings, "data": raw.get("data", []), "solvers": solvers,
+                "formulations": raw.get("formulation", []), "folder": Path(folder)})
         except ValidationError as error:
             found = [(format_keys(keys, len(words)), text) for keys, text in problems_of(error)]
             problems += [one for one in found if one[0] not in dict(problems)]

@@ -45,7 +45,7 @@ class Bench:
         """Respond to a request of the page; the response has the reason where a fit is impossible."""
         known: dict[str, Callable[[Mapping[str, Any]], Any]] = {
             "fit": self._fit, "judge": self._judge, "time": self._time, "export": self._export,
-            "diagnose": self._diagnose}
+            "delay": self._delay, "diagnose": self._diagnose}
         if question not in known:
             raise DataError(f"the page sent an unknown request, {question!r}")
         with SOLVING, warnings.catch_warnings():
@@ -89,6 +89,9 @@ class Bench:
 
     def _judge(self, asked: Mapping[str, Any]) -> dict[str, Any]:
         return views.verdict_view(self._found(asked)[0])
+
+    def _delay(self, asked: Mapping[str, Any]) -> dict[str, Any]:
+        return views.delay_view(Request.parse(asked.get("state")).record(self.source.data))
 
     def _export(self, asked: Mapping[str, Any]) -> dict[str, str]:
         from optid.show.report import render

@@ -1,4 +1,4 @@
-"""A request of a page: channels, a window, a formulation with its arguments, and constraints drawn by hand."""
+"""A request of a page: a record as it is prepared, a formulation with its arguments, constraints drawn by hand."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -43,6 +43,8 @@ class Request:
     arguments: Mapping[str, Any]  # of the formulation
     constraints: tuple[ChosenConstraint, ...] = ()  # set by hand
     draft: bool = False  # whether it is part of a drag: one pass for bands of the step response is then enough
+    detrended: bool = False  # whether a drift of the outputs is removed; constraints stay in the units of the record
+    dt: float | None = None  # sampling time onto which the record is brought; its own if None
 
     @classmethod
     def parse(cls, state: Any, draft: bool = False) -> "Request":
@@ -55,8 +57,9 @@ class Request:
                 if not key.isidentifier():
                     raise ValueError(f"{key!r} is not the name of an argument")
             arguments = {str(key): value for key, value in state["arguments"].items() if value not in (None, "", [])}
+            dt = None if state.get("dt") is None else float(state["dt"])
             found = cls(tuple(map(str, state["inputs"])), tuple(map(str, state["outputs"])), (first, last),
-                        str(state["formulation"]), arguments, constraints, draft)
+                        str(state["formulation"]), arguments, constraints, draft, bool(state.get("detrended")), dt)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise DataError(f"the page sent a state that cannot be read ({type(error).__name__}: {error})") from None
         entry_point(FORMULATIONS, found.formulation)
@@ -66,15 +69,22 @@ class Request:
     def key(self) -> str:
         """A text that is equal for states with the same fit."""
         constraints = [(c.word, dict(c.arguments), c.name) for c in self.constraints]
-        return json.dumps([self.inputs, self.outputs, self.window, self.formulation, dict(self.arguments), constraints,
+        return json.dumps([self.preparation, self.formulation, dict(self.arguments), constraints,
                            self.draft and BAND in [c.word for c in self.constraints]], sort_keys=True)
 
+    @property
+    def preparation(self) -> tuple[Any, ...]:
+        """Channels, window and changes of the samples, equal for requests with the same record."""
+        return self.inputs, self.outputs, self.window, self.detrended, self.dt
+
     def record(self, data: Data) -> Data:
-        """Return the channels and the window of a record."""
+        """Return the channels and the window of a record, detrended and resampled as chosen."""
         if not self.inputs or not self.outputs:
             raise DataError("choose at least one input and one output")
         chosen = data.select(inputs=list(self.inputs), outputs=list(self.outputs))
-        return chosen if self.whole(data) else chosen.window(*self.window)
+        chosen = chosen if self.whole(data) else chosen.window(*self.window)
+        chosen = chosen.detrend(order=1).raw() if self.detrended else chosen
+        return chosen if self.dt is None else chosen.resample(self.dt)
 
     def whole(self, data: Data) -> bool:
         """Whether the window is the whole record: with several experiments, the whole shortest one."""

@@ -23,6 +23,8 @@ def script(request: Request, source: str, whole: bool = False) -> str:
         homes.setdefault(point.module, set()).add(point.attr)
     imports = [f"from {module} import {', '.join(sorted(names))}" for module, names in sorted(homes.items())]
     window = "" if whole else f".window({request.window[0]}, {request.window[1]})"
+    changes = ".detrend(order=1).raw()" * request.detrended
+    changes += "" if request.dt is None else f".resample({request.dt!r})"
     known = [_call(c) for c in request.constraints if c.word != BAND]
     bands = [c for c in request.constraints if c.word == BAND]
     repeated = bool(bands and request.arguments.get("na", 0))
@@ -33,7 +35,7 @@ def script(request: Request, source: str, whole: bool = False) -> str:
     lines = [
         '"""A fit, written by the optid workbench."""', "", "import optid", *imports, "",
         f"data = {source}",
-        f"data = data.select(inputs={list(request.inputs)!r}, outputs={list(request.outputs)!r}){window}",
+        f"data = data.select(inputs={list(request.inputs)!r}, outputs={list(request.outputs)!r}){window}{changes}",
         "constraints = [", *(f"    {one}," for one in known), "]",
         f"fit = {fit % 'constraints'}",
     ]

@@ -87,7 +87,7 @@ class Server(ThreadingHTTPServer):
         data, script = self.source.data, scripts("plot.js", "parts.js", "workbench.js")
         begin = {
             "secret": secret, "start": self.source.start, "name": data.name or "record", "dt": data.dt,
-            "samples": shortest(data), "origins": [e.start for e in data.experiments],
+            "dated": data.dated, "samples": shortest(data), "origins": [e.start for e in data.experiments],
             "inputs": list(data.inputs), "outputs": list(data.outputs),
             "formulations": [name for name in SHOWN if name in find_entry_points(FORMULATIONS)]}
         lead = f"{data.n_samples} samples every {data.interval}"

@@ -8,9 +8,10 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.errors import OptidError
+from optid.errors import DataError, OptidError
 from optid.identify import responses
 from optid.identify.dynamics import input_levels
+from optid.identify.informativity import informativity
 from optid.identify.uncertainty import uncertainty
 from optid.show import charts, summary
 from optid.show.page import encode_chart
@@ -68,6 +69,19 @@ def characteristics(fit: Any, record: Data, output: str | None = None) -> list[d
             "tool": "" if curve.kind == "rate" else curve.kind, "channel": channel if model.m > 1 else None,
             "output": record.outputs[o] if several else None, "dt": model.dt, "interval": list(curve.levels)})
     return found
+
+
+def delay_view(record: Data) -> dict[str, Any]:
+    """Return the lag of the first coefficient of every input, `nk`, and what the record shows, in sentences.
+
+    Raises:
+        DataError: the record shows no delay, with the reason.
+    """
+    told = informativity(record)
+    if told.reason or not told.processes:
+        raise DataError(f"No delay can be estimated from this record: {told.reason or told.untested}")
+    lags = [f"{name!r} acts from lag {lag} on" for name, lag in zip(told.inputs, told.lags)]
+    return {"nk": list(told.lags), "sentences": [*lags, *told.findings]}
 
 
 def verdict_view(fit: Any) -> dict[str, Any]:

@@ -137,7 +137,7 @@ def test_split_validates_on_the_rest_and_the_report_has_it(csv, tmp_path):
     assert result.exit_code == 0, result.output
     assert "100 samples held out of the fit" in result.output
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
-    assert "Test record, not seen by the fit" in page
+    assert "Test record, not used by the fit" in page
 
 
 @pytest.mark.slow

@@ -14,11 +14,11 @@ from optid.identify.equation_error.priors import KERNELS, families, kernel, like
 G = lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.7], np.r_[1.0, np.zeros(99)])
 
 
-def record(seed=0, samples=200, noise=0.3, units=1.0):
+def record(seed=0, samples=200, noise=0.3):
     rng = np.random.default_rng(seed)
     u = rng.normal(size=samples)
     y = lfilter(G, 1.0, u)
-    return Data(u, units * (3.0 + y + noise * y.std() * rng.normal(size=samples)))
+    return Data(u, 3.0 + y + noise * y.std() * rng.normal(size=samples))
 
 
 def regressor(data, lags, nk=1):
@@ -75,12 +75,6 @@ def test_it_is_better_than_least_squares():
                                     [:, 0, 0] - G) for seed in range(4)] for word in ("none", "tc", "dc", "ss")}
     for word in KERNELS:
         assert np.mean(errors[word]) < 0.6 * np.mean(errors["none"])
-
-
-def test_units_do_not_matter():
-    one, other = (optid.fit(record(2, units=unit), "arx", na=10, nb=10, nk=1, prior="dc").model for unit in (1.0, 1e4))
-    assert other.a == pytest.approx(one.a, abs=1e-4)
-    assert other.b[0] == pytest.approx(1e4 * one.b[0], abs=1e-4 * 1e4)
 
 
 def test_constraints_hold_and_have_a_price():

@@ -209,14 +209,6 @@ def test_innovation_form_finds_the_kalman_gain_and_the_noise():
     assert products(fit.model) == pytest.approx(products(model), abs=0.06)
 
 
-def test_the_optimum_does_not_depend_on_units():
-    _, data = system(noise=0.2)
-    one = optid.fit(data, linear, nx=2)
-    other = optid.fit(Data(10 * data.u, data.y * [1e-3, 1e3] + [0.0, 50.0]), linear, nx=2)
-    found = (other.model.simulate(10 * data.u) - other.model.simulate(0 * data.u)) / [1e-3, 1e3]
-    assert found == pytest.approx(one.model.simulate(data.u) - one.model.simulate(0 * data.u), abs=1e-4)
-
-
 def test_covariance_weights_are_a_fixed_point():
     _, data = system(noise=0.2)
     fit = optid.fit(data, linear, nx=2, weighting="determinant")

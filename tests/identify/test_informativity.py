@@ -55,6 +55,13 @@ def test_a_dead_time_is_found_within_a_sample(poles, dead, colour):
     assert found.gain == pytest.approx(2.0, rel=0.05)
 
 
+def test_a_single_outlier_does_not_move_the_dead_time():
+    u = staircase(np.random.default_rng(3), 800)
+    y = driven(u, dead=5)
+    y[400] += 60 * np.std(y)
+    assert processes(optid.Data(u, y))[0].responses[0].nk == 6
+
+
 def test_a_step_has_its_gain_time_constant_and_dead_time():
     u = np.where(np.arange(200) < 20, 0.0, 1.0)
     found = processes(optid.Data(u, driven(u, dead=12, poles=(0.95,), noise=0.02)))[0].responses[0]

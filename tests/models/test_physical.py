@@ -117,22 +117,6 @@ def test_the_optimum_against_a_simulation_written_out(seed):
     assert [row[2] for row in fit.uncertainty.table()] == pytest.approx(np.sqrt(np.diag(covariance))[:4], rel=0.25)
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("scale", [1e-6, 1e5])
-def test_units_change_nothing(scale):
-    data = bent()
-    fit = quiet(data, CUBIC)
-
-    def right(v):
-        x = v["x"]
-        return {"x": v["a"] * x - v["c"] * scale**-2 * x**3 + v["b"] * scale * v["u"], "y": x + v["d"]}
-
-    other = Equations(right, {"x": 0.1 * scale}, {"a": 0.5, "b": 0.8, "c": 0.1, "d": 0.1 * scale}, time="discrete")
-    found = quiet(Data(data.u, scale * data.y), other)
-    assert found.solution.objective == pytest.approx(scale**2 * fit.solution.objective, rel=1e-6)
-    assert found.model.p == pytest.approx(fit.model.p * [1, 1, 1, scale], rel=1e-4)
-
-
 @pytest.mark.parametrize("solver", ["uno", "fatrop"])
 def test_back_ends_agree(solver):
     data = bent(60)

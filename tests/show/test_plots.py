@@ -66,7 +66,10 @@ def test_a_close_up_and_the_record_above_it_have_their_own_times():
 
 def test_a_test_record_is_drawn_instead_of_the_estimation_record():
     first, second = linear_fit().data.split(0.5)
-    ax = plots.fit_over_time(linear_fit(), second).axes[0]
+    figure = plots.fit_over_time(linear_fit(), second)
+    ax = figure.axes[0]
+    figure.draw_without_rendering()
+    assert ax.get_legend().get_window_extent().y1 <= figure.bbox.y1  # four names, not cut
     assert np.array_equal(line(ax, "measured").get_ydata(), second.y[:, 0])
     assert "test record" in ax.get_title(loc="left")
     assert first.n_samples == 150

@@ -89,7 +89,7 @@ def test_the_test_record_is_validated(pages):
         validation = optid.validate(mimo_fit().model, two_by_two(seed=5))
     assert any("outside" in note for note in validation.notes)
     assert all(note in page.text for note in validation.notes)
-    assert "Test record, not seen by the fit" in page.text
+    assert "Test record, not used by the fit" in page.text
     lowest = min(q.fit for q in validation.simulation.values())
     assert f"{lowest:.2f} %" in page.text
 

@@ -310,7 +310,7 @@ def test_compare_tells_an_error_of_the_record_once(folder):
     (("study", "run", "rigs.toml", "--db", "rig.csv"), "rig.csv"),
     (("study", "run", "rigs.toml", "--export", "rows.xlsx"), ".parquet or .csv"),
     (("study", "run", "rigs.toml", "--retry", "crshed"), "Did you mean 'crashed'"),
-    (("study", "run", "rigs.toml", "-w", 0), "'--workers' / '-w'"),
+    (("study", "run", "rigs.toml", "-w", 0), "workers must be a positive integer; got 0"),
     (("study", "report", "none.sqlite", "-o", "."), "it is a folder; name a file in it"),
     (("study", "report", "none.sqlite"), "no such database"),
     (("study", "report", "rigs.toml"), "rigs.toml"),

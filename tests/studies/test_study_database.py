@@ -169,8 +169,6 @@ def made_by(statement):
     ("valve.csv", b"time,u,y\n1,2,3\n" * 1000, "valve.csv is a file of another kind, .*give the one that `optid study"),
     ("study.toml", b'name = "small"\n' * 30, "study.toml is a file of another kind"),
     ("short.sqlite", b"\n", "not a database of studies .it has no tables"),
-    ("old.duckdb", b"\0" * 8 + b"DUCK" + b"\0" * 99,
-     "kept rows in DuckDB. Export it with that version .`optid study export old.duckdb rows.parquet`"),
 ])
 def test_files_of_another_kind_or_version_are_told_with_what_to_do(tmp_path, name, make, words):
     path = tmp_path / name

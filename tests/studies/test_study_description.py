@@ -399,9 +399,9 @@ def test_python_hears_all_problems_with_their_places():
 
 
 @pytest.mark.parametrize("change, words", [
-    ({"data": {"rig": (np.zeros(9), np.zeros(9))}}, "is invalid: must be a record, optid.Data(u, y, dt)"),
-    ({"formulations": [3]}, "formulation[0]: 3 is invalid: must be the name of a formulation"),
-    ({"solvers": 3}, "solver[0]: 3 is invalid: must be the name of a solver"),
+    ({"data": {"rig": (np.zeros(9), np.zeros(9))}}, "data[0]: must be a record, optid.Data(u, y, dt)"),
+    ({"formulations": [3]}, "formulation[0]: must be a table of keys with the name of a formulation; 3 is not"),
+    ({"solvers": 3}, "solver[0]: must be the name of a solver, or a table of keys; 3 is not"),
     ({"solvers": "al"}, "no solver is called 'al'. Did you mean 'all'?"), ({"data": []}, "there is no [[data]]"),
     ({"solvers": []}, "there is no solver"),
 ])

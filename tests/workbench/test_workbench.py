@@ -126,14 +126,15 @@ def test_what_cannot_be_read_or_fitted_is_said():
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("constraints", [
-    [("monotone", {"direction": "increasing"}, "rising"), ("through", {"u": 0.5, "y": 0.3}, "point 1"),
-     ("range", {"low": -0.3, "high": 0.1, "first": -0.5, "last": 0.25}, "corridor 1")],
-    [("disc", {"centre": 0.4, "radius": 0.2}, "disc 1"), ("step_band", {"high": 3.3, "last": 15}, "band 1")],
+@pytest.mark.parametrize("constraints, preparation", [
+    ([("monotone", {"direction": "increasing"}, "rising"), ("through", {"u": 0.5, "y": 0.3}, "point 1"),
+      ("range", {"low": -0.3, "high": 0.1, "first": -0.5, "last": 0.25}, "corridor 1")],
+     {"detrended": True, "dt": 0.2}),
+    ([("disc", {"centre": 0.4, "radius": 0.2}, "disc 1"), ("step_band", {"high": 3.3, "last": 15}, "band 1")], {}),
 ])
-def test_the_script_repeats_the_numbers(constraints):
+def test_the_script_repeats_the_numbers(constraints, preparation):
     of = source()
-    bench, state = Bench(of), constrained({**of.start, "window": [20, 520]}, *constraints)
+    bench, state = Bench(of), constrained({**of.start, "window": [20, 520], **preparation}, *constraints)
     shown = bench.answer("fit", {"state": state})
     assert {price["name"] for price in shown["prices"]} == {name for _, _, name in constraints}
     text = bench.answer("export", {"what": "script", "state": state})["text"]
@@ -146,6 +147,36 @@ def test_the_script_repeats_the_numbers(constraints):
     assert np.array_equal(found["fit"].model.a, kept.model.a)
     assert json.loads(bench.answer("export", {"what": "model", "state": state})["text"])
     assert "<!DOCTYPE html>" in bench.answer("export", {"what": "page", "state": state})["text"]
+
+
+def drifting(late=2, slope=0.01):
+    """Return a record of the thruster whose output is late and drifts by so much a sample."""
+    data = example("thruster").data
+    u, y = data.u.ravel(), data.y.ravel()
+    return optid.Data(u, np.concatenate([np.full(late, y[0]), y[:y.size - late]]) + slope * np.arange(y.size), data.dt,
+                      "current", "thrust")
+
+
+def test_a_record_is_detrended_and_resampled_in_its_own_units():
+    record, flat = drifting(slope=0.01), drifting(slope=0.0)
+    state = {**suggest_state(record, {}), "arguments": {"na": 2, "nb": 1, "nk": 2, "basis": "triangular:4"}}
+    state = constrained({**state, "detrended": True, "dt": 0.2}, ("through", {"u": 0.5, "y": 3.3}, "point"))
+    request = Request.parse(state)
+    found, other = request.record(record), request.record(flat)
+    assert found.dt == 0.2 and found.n_samples == 300 and found.transform.is_identity
+    assert np.ptp(found.y - other.y) < 0.01 < 1 < np.ptp(record.y - flat.y)  # ends of the low-pass
+    assert np.mean(found.y) == pytest.approx(np.mean(record.y), abs=0.02)
+    assert request.fit(record).model.static_curve(0, np.array([0.5])).item() == pytest.approx(3.3)
+
+
+def test_a_delay_is_estimated_or_the_reason_given():
+    record = drifting(late=3, slope=0.0)
+    bench, state = Bench(BenchSource(record, "record", suggest_state(record, {}))), suggest_state(record, {})
+    found = bench.answer("delay", {"state": state})
+    assert found["nk"] == [3] and "'current' acts from lag 3 on" in found["sentences"]
+    still = optid.Data(np.ones(200), record.y[:200], 0.1, "current", "thrust")
+    assert "'current'" in Bench(BenchSource(still, "record", state)).answer(
+        "delay", {"state": {**state, "window": [0, 200]}})["error"]
 
 
 def test_every_experiment_is_fitted_as_a_whole():
@@ -484,7 +515,8 @@ def test_a_dated_record_shows_dates_and_samples_of_the_whole(tmp_path):
     data = optid.Data(data.u, data.y, 60.0, "current", "thrust", start="2024-05-01T06:00").map_signals(
         lambda u: u, lambda y: y, findings=("clock 't': in min, read as seconds",))
     start = suggest_state(data, {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:4"})
-    with served(BenchSource(data, "data", {**start, "window": [100, 500]})) as server, Browser(tmp_path) as browser:
+    start |= {"window": [100, 500], "detrended": True, "dt": 120.0}
+    with served(BenchSource(data, "data", start)) as server, Browser(tmp_path) as browser:
         goto(browser, server)
         assert browser.run("document.querySelector('main section').textContent").split("read")[0].endswith("in min, ")
         assert browser.run(OVERLAPS) == []
@@ -494,6 +526,38 @@ def test_a_dated_record_shows_dates_and_samples_of_the_whole(tmp_path):
         date, sample = tip.split(", sample ")
         assert int(sample) >= 100
         assert np.datetime64(date) == np.datetime64("2024-05-01T06:00") + int(sample) * np.timedelta64(1, "m")
+        ends = browser.run("document.getElementById('dates').textContent").split(" to ")
+        assert ends == ["2024-05-01 07:40:00", "2024-05-01 14:19:00"]
+
+
+@pytest.mark.slow
+def test_a_record_is_prepared_by_buttons(tmp_path):
+    if CHROMIUM is None:
+        pytest.skip(NO_BROWSER)
+    record = drifting(late=3)
+    y = record.y.copy()
+    y[200] += 40  # an outlier, of which the fit warns
+    record = optid.Data(record.u, y, record.dt, record.inputs, record.outputs)
+    with served(BenchSource(record, "record", suggest_state(record, {}))) as server, Browser(tmp_path) as browser:
+        goto(browser, server, 390)
+        warning = browser.run("""(() => { const e = document.querySelector("#warnings li"), s = getComputedStyle(e);
+            return [e.textContent, parseFloat(s.fontSize), s.color === getComputedStyle(document.body).color]; })()""")
+        assert "outlier" in warning[0] and warning[1] > 14 and warning[2]
+        for button in ("#detrend", "#resample"):
+            count = browser.run("timings.length")
+            browser.click(button)
+            settled(browser, count)
+        assert browser.run("[state.detrended, state.dt]") == [True, 0.2]
+        assert browser.run("drawn.get([...drawn.keys()][0]).chart.x.step") == 0.2
+        assert browser.run("document.documentElement.scrollWidth") <= 390 and not browser.run(OVERLAPS)
+        for left in ([True, None], [False, None]):
+            count = browser.run("timings.length")
+            browser.click("#undo")
+            settled(browser, count)
+            assert browser.run("[!!state.detrended, state.dt ?? null]") == left
+        browser.click("#delay")
+        browser.wait("state.arguments.nk === 3 && document.querySelector('#delays li')")
+        assert not browser.run(CONTRAST) and not browser.complaints()
 
 
 @pytest.mark.slow

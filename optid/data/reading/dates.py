@@ -210,7 +210,7 @@ def has_day(form: str) -> bool:
 def choices(forms: Sequence[str]) -> str:
     """Return what to type for dates that may have several formats."""
     others = ", ".join(map(repr, forms[1:]))
-    return f"date_format={forms[0]!r}" + (f" (or {others} where day, month and year stand otherwise)" if others else "")
+    return f"date_format={forms[0]!r}" + (f" (or {others} for another order of day, month and year)" if others else "")
 
 
 def instant(text: str) -> float | None:

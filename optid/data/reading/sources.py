@@ -199,8 +199,8 @@ def _stated_step(named: Mapping[str, Any], label: str) -> tuple[float | None, di
             number = float(np.ravel(value)[0])
             if not 0 < number < np.inf:
                 kind = "rate" if is_rate_name(word) else "time"
-                raise DataError(f"{label}: {name} = {number:g}: the sampling {kind} that stands beside the samples "
-                                "must be positive; leave it out and pass dt=.")
+                raise DataError(f"{label}: {name} = {number:g}: the sampling {kind} beside the samples must be "
+                                "positive; leave it out and pass dt=.")
             step = 1 / number if is_rate_name(word) else number
             del others[name]
     return step, others

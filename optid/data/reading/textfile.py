@@ -107,7 +107,7 @@ def open_text(path: Path, encoding: str | None) -> Iterator[TextFile]:
         except UnicodeError as error:
             kind = encoding or getattr(error, "encoding", "UTF-8")
             raise DataError(f"{path.name} is not {kind} text ({getattr(error, 'reason', error)}): save it as UTF-8, or "
-                            "pass its encoding='latin-1' or whatever it is.") from error
+                            "pass its encoding, such as encoding='latin-1'.") from error
 
 
 def clean(block: bytes, comment: str | None, blanks: bool) -> bytes:

@@ -117,8 +117,8 @@ def hopeless(signals: RecordSignals, inputs: tuple[str, ...], found: list[InputE
         if not one.moves:
             return f"input {one.input!r} does not move"
         if one.ramp:
-            return (f"input {one.input!r} rises evenly with time, as a clock does: its effect cannot be told from a "
-                    "drift of the output")
+            return (f"input {one.input!r} rises evenly with time, as a clock does: its effect cannot be distinguished "
+                    "from a drift of the output")
         left = max((len(u) - 1 - int(np.flatnonzero(np.diff(u))[0]) for u in signals.inputs(c) if np.ptp(u)), default=0)
         if left <= AFTER:
             return (f"input {one.input!r} moves for the first time {plural(left, 'sample', '')} before the end: its "

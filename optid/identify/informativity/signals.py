@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.data.record import Data, Experiment
 from optid.data.stretches import interpolate_missing
+from optid.identify.outliers import find_outliers
 from optid.models.recursions import lfilter
 
 SAMPLES, EXPERIMENTS = 30_000, 40  # that are read, from the beginning of a record
@@ -35,8 +36,8 @@ class RecordSignals:
 
     Attributes:
         u: inputs (T, m), the last value held where one is missing.
-        y: outputs (T, l), interpolated where one is missing.
-        present: whether an output was measured, (T, l).
+        y: outputs (T, l), interpolated where one is missing or an isolated outlier.
+        present: whether an output was measured, (T, l), and is no outlier.
         lost: whether an input is missing, (T, m).
         u_scale, y_scale: spread of every channel, (m,) and (l,).
     """
@@ -53,7 +54,8 @@ class RecordSignals:
         """Read the beginning of a record."""
         experiments = beginning(data)
         u = [hold_last(e.u) for e in experiments]
-        y = [interpolate_missing(e.y) for e in experiments]
+        measured = _without_outliers([e.y for e in experiments])
+        y = [interpolate_missing(one) for one in measured]
         scales = []
         for i, several in enumerate((u, y)):
             whole = np.vstack(several)
@@ -61,7 +63,7 @@ class RecordSignals:
             spread = np.where(spread > 1e-14 * np.abs(middle), spread, 1.0)
             (u, y)[i][:] = [(x - middle) / spread for x in several]
             scales.append(spread)
-        return cls(tuple(u), tuple(y), tuple(np.isfinite(e.y) for e in experiments),
+        return cls(tuple(u), tuple(y), tuple(np.isfinite(one) for one in measured),
                    tuple(np.isnan(e.u) for e in experiments), *scales)
 
     @cached_property
@@ -85,6 +87,15 @@ class RecordSignals:
     def levels(self, c: int) -> int:
         """Count the distinct values of an input."""
         return np.unique(np.round(np.concatenate(self.inputs(c)), 9)).size
+
+
+def _without_outliers(outputs: Sequence[Array]) -> list[Array]:
+    """Return outputs (T, l) of every experiment, missing at isolated outliers: a single one may hide the dynamics."""
+    kept = [np.array(y, dtype=float) for y in outputs]
+    for o in range(kept[0].shape[1] if kept else 0):
+        for y, samples in zip(kept, find_outliers([y[:, o] for y in kept])):
+            y[samples, o] = np.nan
+    return kept
 
 
 def hold_last(samples: Array) -> Array:

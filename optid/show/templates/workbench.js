@@ -60,6 +60,7 @@ function judgedOrStale() {
   ["word", "sentence", "parts", "tests"].forEach((id) => at(id).classList.toggle("stale", !!judged && judged !== shown.asked));
 }
 
+const notes = (id, sentences) => at(id).replaceChildren(...sentences.map((sentence) => element("li", {}, sentence)));
 const row = (first, ...cells) => element("tr", {}, element("th", { scope: "row" }, first), ...cells.map((cell) => element("td", {}, cell)));
 
 // ---- history
@@ -79,7 +80,8 @@ function travel(from, to) { if (!from.length) return; to.push(JSON.stringify(sta
 
 function show(found) {
   at("cards").replaceChildren(...found.cards.map(([label, value]) => element("div", { class: "card" }, element("b", {}, value), element("span", {}, label))));
-  at("optimum").textContent = `${found.word}. ${found.sentence} ${found.findings.join(" ")}`;
+  at("optimum").textContent = `${found.word}. ${found.sentence}`;
+  notes("warnings", found.findings);
   if (!document.documentElement.dataset.judged) { at("word").textContent = "Fitted"; at("sentence").textContent = "The verdict follows."; }
   judgedOrStale();
   drawAll(at("time"), found.time);
@@ -125,14 +127,15 @@ function drawChart(figure, chart, key) {
   const moved = (low, high) => {
     for (const other of drawn.values()) if (other.chart.group === kept.chart.group && other !== kept) other.plot.setX(low, high);
     if (tool !== "time") return;
-    const first = Math.floor((low - origin()) / BEGIN.dt), last = Math.ceil((high - origin()) / BEGIN.dt) + 1;
-    view = first <= 0 && last >= state.window[1] - state.window[0] ? null : [Math.max(first, 0), last];
+    const { start, step } = kept.chart.x, count = ((state.window[1] - state.window[0]) * BEGIN.dt) / step;
+    const first = Math.floor((low - start) / step), last = Math.ceil((high - start) / step) + 1;
+    view = first <= 0 && last >= count ? null : [Math.max(first, 0), last];
     clearTimeout(waiting);
     waiting = setTimeout(async () => { const sent = request(), found = await ask("time"); if (!found.error && sent === request()) drawAll(at("time"), found); }, 120);
   };
   addLegend(modes, chart.title, series, hidden, () => kept.plot.draw());
-  // of a record in a window the samples are counted from the beginning of the whole record
-  const x = tool === "time" ? { ...chart.x, start: BEGIN.origins[look.experiment] } : chart.x;
+  // of a record in a window, or resampled, the samples are counted as those of the whole record
+  const x = tool === "time" ? { ...chart.x, start: BEGIN.origins[look.experiment], step: BEGIN.dt } : chart.x;
   kept.plot = makePlot(host, { ...chart, x, label: `${chart.title}. ${chart.caption}`, series, moved: chart.group ? moved : null,
     places: (axis) => (tool ? mine(kept.chart).map((c) => boxOf(c, kept.chart)).flatMap((b) => (axis ? [b.y0, b.y1] : [b.x0, b.x1])) : []),
     below: (f) => (tool ? hands(kept.chart, f) : []), grab: (event, x, y, f) => tool && grab(event, x, y, f, kept) }, hidden);
@@ -158,8 +161,6 @@ function accepts(word) {
   if (word === "stable") return one && na > 0;
   return one && (word !== "disc" || na === 1 || na === 2);
 }
-
-const origin = () => BEGIN.origins[look.experiment] + state.window[0] * BEGIN.dt;
 
 // ---- constraints on the plots: each has a box in the units of its plot, and handles
 
@@ -318,6 +319,12 @@ function controls() {
     element("div", { class: "ticks", style: "grid-template-columns: 1fr" }, ...BEGIN[key].map((name) => tick(name, state[key].includes(name), (on) =>
       change((s) => { s[key] = BEGIN[key].filter((n) => (n === name ? on : s[key].includes(n))); })))))));
   [["first", 0], ["last", 1]].forEach(([id, k]) => { at(id).value = state.window[k]; at(id).max = BEGIN.samples; });
+  const [from, to] = state.window.map((sample, k) => BEGIN.origins[look.experiment] + (sample - k) * BEGIN.dt);
+  at("dates").textContent = BEGIN.dated ? `${dateText(from)} to ${dateText(to)}` : "";
+  at("every").value = state.dt ?? BEGIN.dt;
+  at("detrend").setAttribute("aria-pressed", String(!!state.detrended));
+  at("delay").disabled = !takes(state.formulation).includes("nk");
+  notes("delays", []);
   if (!state.outputs.includes(look.output)) look.output = state.outputs[0];
   at("look").replaceChildren(
     ...selection("Experiment", BEGIN.origins.map((_, k) => [k, `${k + 1} of ${BEGIN.origins.length}`]), look.experiment, (k) => { look.experiment = Number(k); view = null; refit(); }),
@@ -398,6 +405,20 @@ async function diagnose() {
   document.documentElement.dataset.diagnosed = String(Number(document.documentElement.dataset.diagnosed || 0) + 1);
 }
 
+// ---- preparation of the record
+
+function resample(dt) { change((s) => { s.dt = dt === BEGIN.dt ? null : dt; }); }
+
+async function estimateDelay() {
+  at("delay").disabled = true;
+  const asked = JSON.stringify(state), found = await ask("delay");
+  at("delay").disabled = false;
+  at("trouble").textContent = found.error || "";
+  if (found.error || JSON.stringify(state) !== asked) return;
+  change((s) => { s.arguments.nk = found.nk.length > 1 ? found.nk : found.nk[0]; });
+  notes("delays", found.sentences);
+}
+
 // ---- start
 
 async function save(what) {
@@ -409,6 +430,10 @@ async function save(what) {
 }
 
 themeButton();
+at("detrend").addEventListener("click", () => change((s) => { s.detrended = !s.detrended; }));
+at("resample").addEventListener("click", () => resample(2 * (state.dt ?? BEGIN.dt)));
+at("every").addEventListener("change", (e) => resample(numberIn(e.target, state.dt ?? BEGIN.dt)));
+at("delay").addEventListener("click", estimateDelay);
 at("undo").addEventListener("click", () => travel(past, future));
 at("redo").addEventListener("click", () => travel(future, past));
 at("pin").addEventListener("click", () => { if (!shown) return; pins.push({ ...shown, name: `pin ${pins.length + 1}`, charts: [...shown.charts, ...shown.time] }); pinList(); show(shown); });

@@ -52,8 +52,8 @@ def simulate(name: str, samples: int | None = None, noise: float | None = None, 
     samples = chosen.samples if samples is None else samples
     noise = chosen.noise if noise is None else noise
     if samples < 1 or not (np.isfinite(noise) and noise >= 0):
-        raise DataError(f"system {name!r}: {samples} samples with noise {noise}: at least one sample and a finite "
-                        "noise that is not negative are needed")
+        raise DataError(f"system {name!r}: {samples} samples with noise {noise}; samples must be positive, the "
+                        "noise finite and not negative")
     return chosen.simulate(samples, noise, seed)
 
 

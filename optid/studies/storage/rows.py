@@ -22,7 +22,7 @@ OUTCOMES = {
     DONE: "the fit was completed and judged; the result is in `status_verified`",
     TIME_LIMIT: "the worker was killed because the cell took longer than its time limit",
     MEMORY_LIMIT: "the worker exceeded its memory limit, or the machine had no more memory",
-    CRASHED: "the worker died: segmentation fault, abort, or an exit of its own",
+    CRASHED: "the worker died: segmentation fault, abort, or it exited by itself",
     KILLED: "the worker was killed from outside; the next run of the study runs the cell again",
     ERROR: "the cell could not be run: unreadable record, wrong argument, an exception outside the solver",
     REFUSED: "the solver cannot take this formulation, or is not installed; nothing was run",

@@ -281,10 +281,6 @@ def _check_kind(path: Path) -> None:
             head = file.read(16)
     except OSError as error:
         raise DatabaseError(f"{path} cannot be opened: {error.strerror}") from None
-    if head[8:12] == b"DUCK":
-        raise DatabaseError(f"{path} was written by an earlier optid, which kept rows in DuckDB. Export it with that "
-                            f"version (`optid study export {path.name} rows.parquet`); `optid study report "
-                            "rows.parquet` of this one reads the export. New runs need another database")
     if head and head != b"SQLite format 3\0":
         raise DatabaseError(f"{path} is a file of another kind, not a database of studies: give the one that `optid "
                             "study run` wrote, or another name for a new one")

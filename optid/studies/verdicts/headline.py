@@ -36,7 +36,8 @@ def headline(overall: StandingsSection, sections: tuple[StandingsSection, ...], 
     text = f"{describe_comparison(overall.found)}. "
     text += f"{most.solver} solved most, {of(most.solved, len(overall.found.data))}."
     if len(decided) < len(several):
-        text += f" For {len(several) - len(decided)} of {plural(len(several), 'formulation')} it cannot be told."
+        undecided = len(several) - len(decided)
+        text += f" For {undecided} of {plural(len(several), 'formulation')} the comparison cannot tell."
     if len(several) < len(sections):
         text += f" {plural(len(sections) - len(several), 'formulation')} had a single solver, so nothing to compare."
     tones = [_tone(one.standing(name), len(one.found.data)) for name, theirs in leaders.items() for one in theirs]
