@@ -62,6 +62,15 @@ def test_a_single_outlier_does_not_move_the_dead_time():
     assert processes(optid.Data(u, y))[0].responses[0].nk == 6
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_responses_to_rare_pulses_are_no_outliers(seed):
+    rng, u = np.random.default_rng(seed), np.zeros(1000)
+    u[rng.choice(np.arange(20, 980), 10, replace=False)] = rng.uniform(0.5, 1.5, 10)
+    y = np.convolve(u, np.concatenate([np.zeros(3), 0.2 ** np.arange(5)]))[:1000] + 0.01 * rng.standard_normal(1000)
+    found = processes(optid.Data(u, y))[0].responses[0]
+    assert found.nk in (2, 3) and found.gain == pytest.approx(1.25, rel=0.1)
+
+
 def test_a_step_has_its_gain_time_constant_and_dead_time():
     u = np.where(np.arange(200) < 20, 0.0, 1.0)
     found = processes(optid.Data(u, driven(u, dead=12, poles=(0.95,), noise=0.02)))[0].responses[0]

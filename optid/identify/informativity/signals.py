@@ -10,14 +10,17 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import bdtrc
 
 from optid.arrays import Array
 from optid.data.record import Data, Experiment
 from optid.data.stretches import interpolate_missing
-from optid.identify.outliers import find_outliers
+from optid.identify.outliers import LONGEST, find_outliers
 from optid.models.recursions import lfilter
 
 SAMPLES, EXPERIMENTS = 30_000, 40  # that are read, from the beginning of a record
+LATEST = 500  # samples after a move of an input within which its responses are looked for
+CHANCE = 0.01  # probability that pulses follow moves equally late by chance
 DISTINCT = 1e-6  # share of its length that a decay must keep beside the level to count
 Poles = NDArray[np.complex128]
 
@@ -54,7 +57,7 @@ class RecordSignals:
         """Read the beginning of a record."""
         experiments = beginning(data)
         u = [hold_last(e.u) for e in experiments]
-        measured = _without_outliers([e.y for e in experiments])
+        measured = _without_outliers([e.y for e in experiments], u)
         y = [interpolate_missing(one) for one in measured]
         scales = []
         for i, several in enumerate((u, y)):
@@ -89,13 +92,47 @@ class RecordSignals:
         return np.unique(np.round(np.concatenate(self.inputs(c)), 9)).size
 
 
-def _without_outliers(outputs: Sequence[Array]) -> list[Array]:
-    """Return outputs (T, l) of every experiment, missing at isolated outliers: a single one may hide the dynamics."""
+def _without_outliers(outputs: Sequence[Array], inputs: Sequence[Array]) -> list[Array]:
+    """Return outputs (T, l) of every experiment, missing at isolated outliers: a single one may hide the dynamics.
+
+    Pulses that may answer the inputs (T, m) are none.
+    """
     kept = [np.array(y, dtype=float) for y in outputs]
     for o in range(kept[0].shape[1] if kept else 0):
-        for y, samples in zip(kept, find_outliers([y[:, o] for y in kept])):
-            y[samples, o] = np.nan
+        found = find_outliers([y[:, o] for y in kept])
+        if any(map(len, found)) and not _may_answer(found, inputs):
+            for y, samples in zip(kept, found):
+                y[samples, o] = np.nan
     return kept
+
+
+def _may_answer(found: Sequence[Array], inputs: Sequence[Array]) -> bool:
+    """Whether pulses at these samples of every experiment may be the responses to inputs that move now and then.
+
+    They may where an input has pulses itself, or where more of them begin equally long after its moves than by chance.
+    """
+    begun = [samples[np.diff(samples, prepend=-2) > 1] for samples in found]
+    runs, count = sum(map(len, begun)), sum(map(len, inputs))
+    for c in range(inputs[0].shape[1]):
+        own = [u[:, c] for u in inputs]
+        moves = [np.append(False, np.diff(u) != 0) for u in own]
+        share = sum(map(np.sum, moves)) / count
+        if any(map(_is_pulsed, own)) or any(map(len, find_outliers(own))):
+            return True
+        lags = min(max(map(len, own)) // 4, LATEST)
+        hits = [sum(int(np.sum(m[k[k >= lag] - lag])) for k, m in zip(begun, moves)) for lag in range(lags)]
+        most = max(hits, default=0)
+        if 2 * most >= runs and most and lags * bdtrc(most - 1, runs, share) < CHANCE:
+            return True
+    return False
+
+
+def _is_pulsed(u: Array) -> bool:
+    """Whether an input (T,) leaves its usual value for a few samples at a time."""
+    values, counts = np.unique(u, return_counts=True)
+    away = np.flatnonzero(np.diff(np.concatenate([[False], u != values[np.argmax(counts)], [False]])))
+    lengths = away[1::2] - away[::2]
+    return lengths.size > 0 and int(lengths.max()) <= LONGEST
 
 
 def hold_last(samples: Array) -> Array:
