@@ -208,7 +208,7 @@ class Decisions:
         event = self._name(now, best, gains, window, plant)
         if self.phase == LOST and (left := excursion(self.alarm - window.length, self.alarm + 1)):
             return self._distrust(now, left)  # what no fault explains is an error of the model
-        if event is None or event.kind != "isolated" or self.recent is None:
+        if event is None or event.kind != "isolated" or self.recent is None or not np.isfinite(self.rules["odd"]):
             return event
         if self.phase == LOST:
             return self._by_several(event, self.recent.answers(self.listed, now + 1))
