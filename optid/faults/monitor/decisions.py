@@ -208,7 +208,7 @@ class Decisions:
         event = self._name(now, best, gains, window, plant)
         if self.phase == LOST and (left := excursion(self.alarm - window.length, self.alarm + 1)):
             return self._distrust(now, left)  # what no fault explains is an error of the model
-        if event is None or event.kind != "isolated" or self.recent is None or not np.isfinite(self.rules["odd"]):
+        if event is None or not event.isolates or self.recent is None or not np.isfinite(self.rules["odd"]):
             return event
         if self.phase == LOST:
             return self._by_several(event, self.recent.answers(self.listed, now + 1))
@@ -340,9 +340,10 @@ class Decisions:
         age = now - self.alarm
         if self.recent is None or not _is_due(age, SEVERAL_AT) or age >= self.recent.last(0):
             return None
-        noise = self._noisy_sensor(now, window)
-        other = Event("revised", now, ((UNKNOWN, 1.0),)) if noise is None else replace(noise, kind="revised")
-        return self._by_several(other, self.recent.answers(self.listed, now + 1))
+        noise, found = self._noisy_sensor(now, window), self.recent.answers(self.listed, now + 1)
+        if noise is None or noise.statistic <= self.thresholds.max():
+            noise = Event("revised", now, ((UNKNOWN, 1.0),), note="no candidate explains it")
+        return None if found is None else self._by_several(replace(noise, kind="revised"), found)
 
     def _beside(self, event: Event, recent: Recent, window: Window, plant: RunningFilter) -> Event | None:
         """Return the event of a fault named soon after others, unless a diagnosis contradicts all of them together."""
@@ -367,8 +368,6 @@ class Decisions:
         rival = other.statistic - float(self.thresholds.max())
         if found and (other.candidates[0][0] == UNKNOWN or found[0].gain > rival):
             other = Event.of_answers(other.kind, other.sample, found)
-        elif other.kind == "revised" and rival <= 0:
-            return None
         labels = [label for label, _ in other.candidates]
         if labels == self.told:
             return None

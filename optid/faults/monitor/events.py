@@ -48,6 +48,11 @@ class Event:
                    tuple(sizes.tolist()), first.gain, note)
 
     @property
+    def isolates(self) -> bool:
+        """Whether candidates are named, or none is left."""
+        return self.kind == "isolated"
+
+    @property
     def ends_fault(self) -> bool:
         """Whether a fault that was named is over."""
         return self.kind == "cleared" and bool(self.candidates)
