@@ -1,10 +1,13 @@
-"""Write the pictures of the start page into `docs/pictures`: pages of the commands as a browser draws them.
+"""Write the pictures of the documentation into `docs/pictures`: pages of the commands as a browser draws them.
 
     python docs/pictures.py
 
 It needs a Chromium on PATH. The pictures are part of the project, so that building the site needs no browser.
 """
 
+import os
+import re
+import shlex
 import sys
 import tempfile
 import threading
@@ -24,12 +27,8 @@ sys.path.insert(0, str(HOME.parent / "tests" / "helpers"))
 from browser import Browser  # noqa: E402
 
 SIZE = 1180, 720
-PAGES = {
-    "verdict": ["fit", "--example", "heater"],
-    "fault": ["diagnose", "MODEL", "--example", "broken_thruster", "--identified", "thruster"],
-}
-MODEL = ["fit", "--example", "thruster", "--formulation", "hammerstein_ss.exact", "--nx", "2", "--set",
-         "criterion=prediction", "--model"]
+FAULTS = {"diagnosis": "fault", "repair": "repair"}
+"""Pictures of the pages that the commands of `faults.md` write."""
 
 
 def run(*words: str) -> None:
@@ -39,15 +38,24 @@ def run(*words: str) -> None:
         raise SystemExit(done.output)
 
 
+def draw(browser: Browser, page: Path, name: str) -> None:
+    """Draw the first screen of a page."""
+    browser.open(page, "document.readyState === 'complete'")
+    browser.run("(document.querySelector('.verdict') || document.body).scrollIntoView({behavior: 'instant'})")
+    browser.picture(HOME / "pictures" / f"{name}.png")
+
+
 def write_pages(browser: Browser, folder: Path) -> None:
-    """Draw the first screen of the page of a fit, and of a diagnosis."""
-    run(*MODEL, str(folder / "model.json"))
-    for name, words in PAGES.items():
-        page = folder / f"{name}.html"
-        run(*[str(folder / "model.json") if word == "MODEL" else word for word in words], "--report", str(page))
-        browser.open(page, "document.readyState === 'complete'")
-        browser.run("document.querySelector('.verdict').scrollIntoView({behavior: 'instant'})")
-        browser.picture(HOME / "pictures" / f"{name}.png")
+    """Draw the page of a fit, and those of a diagnosis and a repair by the script and the commands of `faults.md`."""
+    run("fit", "--example", "heater", "--report", str(folder / "verdict.html"))
+    draw(browser, folder / "verdict.html", "verdict")
+    text = (HOME / "faults.md").read_text()
+    os.chdir(folder)
+    exec(text.split("```python\n")[1].split("```")[0], {})
+    for command in re.findall(r"^    optid ((?:fit|diagnose|reformulate) (?:.*\\\n)*.*)$", text, re.MULTILINE):
+        run(*shlex.split(command.replace("\\\n", " ")))
+    for page, name in FAULTS.items():
+        draw(browser, folder / f"{page}.html", name)
 
 
 def write_workbench(browser: Browser) -> None:

@@ -424,6 +424,18 @@ def test_what_no_candidate_explains_is_unknown():
     assert all(label != "unknown" for event in sure.run(u, shaken) for label, _ in event.candidates)
 
 
+def test_two_faults_at_once_are_told_together():
+    """No single one is claimed once the record contradicts it, and none is named beside the pair."""
+    model, u = plant(), levels(320, 6)
+    broken = [Fault.step("sensor:y1", 150, 2.0), Fault.step("sensor:y2", 150, 2.0)]
+    monitor = watch(model, listed(model, "bias"), 60, 30.0)
+    events = [e for e in monitor.run(u, inject(model, u, broken, seed=7)) if e.kind in ("isolated", "revised")]
+    last = events[-1]
+    assert last.candidates[0][0] == "sensor:y1 + sensor:y2" and last.note == "more than one fault"
+    assert abs(last.onset - 150) <= 1 and np.allclose(last.size, 2.0, atol=0.3)
+    assert all(e.sample <= 165 for e in events if "more than" not in e.note) and monitor.alarmed
+
+
 def test_a_loss_without_excitation_gets_no_verdict_alone():
     u = levels(400, 4)
     u[100:] = [0.8, -0.5]

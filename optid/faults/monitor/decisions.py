@@ -1,13 +1,14 @@
 """The decisions of a monitor: raise an alarm, isolate, carry and clear a fault."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.faults.diagnosis.answers import FaultAnswer
 from optid.faults.monitor.actuator_kinds import groups_of, is_grouped, kinds, likeliest
 from optid.faults.monitor.arl import COMMON
 from optid.faults.monitor.columns import Columns, Window
@@ -47,8 +48,8 @@ WINDOWS, CHANGED = 40, 0.2
 """Windows from which the colour of the noise is taken, and the least change, of the logarithm, of the thresholds."""
 
 WATCHING, NAMING, SETTLING, LOST, UNTRUSTED = range(5)
-"""Phases: no alarm; alarm, not isolated; isolated, the size not yet settled; an alarm that no candidate explains; the
-plant is where the model was not identified, and the model does not describe it there."""
+"""Phases: no alarm; alarm, not isolated; isolated, the size not yet settled; an alarm that no candidate explains alone;
+the plant is where the model was not identified, and the model does not describe it there."""
 
 Excursion = Callable[[int, int], tuple[str, int] | None]
 """(since, before) -> channel that was far outside its range after `since`, and when it left it, `before` a sample."""
@@ -56,8 +57,14 @@ Excursion = Callable[[int, int], tuple[str, int] | None]
 AGAIN_AT = 1.25
 """Growth of the samples since an onset after which the kind of a carried actuator is judged again."""
 
-NOTHING, AGAIN = -1, -2
-"""No candidate is isolated; no candidate has explained the alarm before."""
+SEVERAL_AT = 2.0
+"""Growth of the samples since an alarm that no candidate explains after which several faults are searched again."""
+
+UNKNOWN = "unknown"
+"""Label of a fault that no candidate explains."""
+
+NOTHING = -1
+"""No candidate is isolated."""
 
 
 @dataclass(eq=False)
@@ -184,24 +191,28 @@ class Decisions:
             return None
         gains = np.where(window.peak > 0, window.statistic - self.thresholds, -np.inf)
         best, watching = int(np.argmax(gains)), self.phase == WATCHING
-        if self.phase in (WATCHING, LOST) and gains[best] > 0:
+        if watching and gains[best] > 0:
             onset = now - int(window.peak[best]) + 1
             if left := excursion(onset - window.length, onset):  # a fault drives channels out after its onset only
                 return self._distrust(now, left)
             self.phase, self.alarm = NAMING, now
-            return self._event("alarm", now, best, gains, window) if watching else None
+            return self._event("alarm", now, best, gains, window)
         if watching:
             return self._review(now, window, plant)
         if not np.isfinite(gains[best]):
             return None
         if self.phase == LOST:
-            return self._clear(now) if self.quiet >= self.rules["still"] else None
+            return self._judged_again(now, window)
         if hold:
             return None
         event = self._name(now, best, gains, window, plant)
         if self.phase == LOST and (left := excursion(self.alarm - window.length, self.alarm + 1)):
             return self._distrust(now, left)  # what no fault explains is an error of the model
-        return event
+        if event is None or not event.isolates or self.recent is None or not np.isfinite(self.rules["odd"]):
+            return event
+        if self.phase == LOST:
+            return self._by_several(event, self.recent.answers(self.listed, now + 1))
+        return self._beside(event, self.recent, window, plant)
 
     def _distrust(self, now: int, left: tuple[str, int]) -> Event:
         name, since = left
@@ -215,8 +226,7 @@ class Decisions:
 
     def _name(self, now: int, best: int, gains: Array, window: Window, plant: RunningFilter) -> Event | None:
         rule, noise = self.rules, self._noisy_sensor(now, window)
-        # increased noise is an answer, too, and the likely one where no candidate explained the alarm before
-        louder = (0.0 if noise is None else noise.statistic) - float(self.thresholds.max()) * (self.named != AGAIN)
+        louder = (0.0 if noise is None else noise.statistic) - float(self.thresholds.max())  # an answer, too
         rivals = [gains[self.group(c)].max() for c in sorted(set(self.groups))]
         share = np.exp(np.clip(np.append(rivals, louder) - gains[best], -700, 700) / 2)
         sure = 1 / share.sum() >= rule["certainty"]
@@ -314,16 +324,55 @@ class Decisions:
         window.restart()
         self.phase, self.named, self.quiet = WATCHING, NOTHING, 0
 
-    def _lost(self, now: int, best: int, window: Window, noise: Event | None) -> Event | None:
-        said, onset = self.named == AGAIN, now - int(window.peak[best]) + 1
-        energy = float(window.statistic[best])
-        self.phase, self.named, self.quiet = LOST, AGAIN, 0
+    def _lost(self, now: int, best: int, window: Window, noise: Event | None) -> Event:
+        """Return more noise of a sensor, or that no candidate explains the alarm."""
+        onset, energy = now - int(window.peak[best]) + 1, float(window.statistic[best])
+        self.phase, self.named, self.quiet, self.told = LOST, NOTHING, 0, []
         window.restart()
-        if said:
-            return None
         if noise is not None and noise.statistic > self.thresholds.max():
             return noise
-        return Event("isolated", now, (("unknown", 1.0),), onset, (), energy, "no candidate explains it")
+        return Event("isolated", now, ((UNKNOWN, 1.0),), onset, (), energy, "no candidate explains it")
+
+    def _judged_again(self, now: int, window: Window) -> Event | None:
+        """Return what is known now of an alarm that no candidate explains alone; no other fault is named beside it."""
+        if self.quiet >= self.rules["still"]:
+            return self._clear(now)
+        age = now - self.alarm
+        if self.recent is None or not _is_due(age, SEVERAL_AT) or age >= self.recent.last(0):
+            return None
+        noise, found = self._noisy_sensor(now, window), self.recent.answers(self.listed, now + 1)
+        if noise is None or noise.statistic <= self.thresholds.max():
+            noise = Event("revised", now, ((UNKNOWN, 1.0),), note="no candidate explains it")
+        return None if found is None else self._by_several(replace(noise, kind="revised"), found)
+
+    def _beside(self, event: Event, recent: Recent, window: Window, plant: RunningFilter) -> Event | None:
+        """Return the event of a fault named soon after others, unless a diagnosis contradicts all of them together."""
+        young = [number for number, onset in self.onsets if event.sample - onset < recent.last(0)]
+        found = recent.answers(self.listed, event.sample + 1) if young else None
+        names = {c.name for c in self.listed if c.label in dict(event.candidates)}
+        names |= {self.columns.candidates[number].name for number in young}
+        if found is None or any({fault.name for fault in one.faults} <= names for one in found):
+            return event
+        for number in young:
+            self._release(number, window, plant)
+        self.phase, self.named, self.quiet, self.told = LOST, NOTHING, 0, []
+        window.restart()
+        note = "no candidate explains it, nor those that were named before"
+        return self._by_several(replace(event, candidates=((UNKNOWN, 1.0),), size=(), note=note), found)
+
+    def _by_several(self, other: Event, found: tuple[FaultAnswer, ...] | None) -> Event | None:
+        """Return the answers of a diagnosis, several faults among them, where they explain more than another event.
+
+        What was told before is not repeated.
+        """
+        rival = other.statistic - float(self.thresholds.max())
+        if found and (other.candidates[0][0] == UNKNOWN or found[0].gain > rival):
+            other = Event.of_answers(other.kind, other.sample, found)
+        labels = [label for label, _ in other.candidates]
+        if labels == self.told:
+            return None
+        self.told = labels
+        return other
 
     def _left_over(self, number: int, window: Window) -> tuple[float, float]:
         """Excess of the residual since the onset of a candidate in standard deviations, and degrees of freedom."""
@@ -382,9 +431,7 @@ class Decisions:
             sizes, covariance = plant.held[own] + whole @ plant.x[at], whole @ plant.P[np.ix_(at, at)] @ whole.T
             energy = float(sizes @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ sizes)
             if energy < self.rules["forgiven"] * self.q[owner]:
-                plant.release(rows, own, window)
-                self.undecided, self.onsets = ([one for one in kept if one[0] != owner]
-                                               for kept in (self.undecided, self.onsets))
+                self._release(owner, window, plant)
                 return Event("cleared", now, ((self.labels[owner], 1.0),))
             if event := self._revise(now, owner, sizes, covariance):
                 return event
@@ -394,6 +441,13 @@ class Decisions:
                 for p in reversed(rows):
                     plant.forget(p, window)
         return None
+
+    def _release(self, owner: int, window: Window, plant: RunningFilter) -> None:
+        """Stop compensating a fault."""
+        rows = [p for p, one in enumerate(plant.directions) if one.owner == owner]
+        plant.release(rows, self.columns.of(owner), window)
+        self.undecided, self.onsets = ([one for one in kept if one[0] != owner]
+                                       for kept in (self.undecided, self.onsets))
 
     def _revise(self, now: int, owner: int, sizes: Array, covariance: Array) -> Event | None:
         """Return the event of a carried actuator whose kind has become clearer."""
@@ -414,7 +468,7 @@ class Decisions:
         """Return {label: likelihood} of a carried actuator; empty where nothing new is to be expected yet."""
         if self.recent is not None and len(self.onsets) == 1:
             age = max(now - self.onsets[0][1], 1)
-            if int(np.log(age + 1) / np.log(AGAIN_AT)) == int(np.log(age) / np.log(AGAIN_AT)):
+            if not _is_due(age, AGAIN_AT):
                 return {}
             if age < self.recent.last(0):
                 return self._judged(owner, self.onsets[0][1], now)
@@ -438,6 +492,11 @@ class Decisions:
         k, o = np.unravel_index(int(np.argmax(gain)), gain.shape)
         return Event("isolated", now, ((f"sensor:{self.outputs[o]} noise", 1.0),), now - int(k),
                      (float(np.sqrt(share[k, o])),), float(gain[k, o]), "size is the factor of the standard deviation")
+
+
+def _is_due(age: int, growth: float) -> bool:
+    """Whether something so old is judged again, at ages that grow by a factor."""
+    return age > 0 and int(np.log(age + 1) / np.log(growth)) > int(np.log(age) / np.log(growth))
 
 
 def _fading(plant: RunningFilter, energy: float, faded: float) -> int:

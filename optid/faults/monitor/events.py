@@ -1,7 +1,12 @@
 """The events of a monitor and the faults that it carries."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
+
+from optid.faults.diagnosis.answers import FaultAnswer
 
 
 @dataclass(frozen=True)
@@ -10,13 +15,14 @@ class Event:
 
     Attributes:
         kind: "alarm"; "isolated" (one candidate is left, or several after the time allowed); "revised" (fewer kinds of
-            an isolated actuator are left, or another one); "cleared"; "untestable" (a total loss of the actuator is not
+            an isolated actuator are left, another one, or several faults); "cleared"; "untestable" (a total loss is not
             detectable, or not isolable from a constant), "testable" (again); "outside" (an input left the identified
             range), "inside" (again); "untrusted" (a channel is far outside the range of the identification since
             before the onset, and the model does not describe the plant there: no fault is named until a window after
             it is back, which is "cleared"); or "adapted" (the thresholds, to the colour of the noise).
         sample: counted from the first sample of the stream.
-        candidates: (label, posterior) of the 95 % set, most probable first; ("unknown", 1.0) where none explains it.
+        candidates: (label, posterior) of the 95 % set, most probable first, labels of faults at once joined by " + ";
+            ("unknown", 1.0) where none explains it.
         onset: first sample of the fault, of the first candidate; for "untestable" the first untestable sample.
         size: magnitudes of the first candidate, as in `Dictionary.signature`.
         statistic: energy explained by the first candidate; of "untestable" that of a total loss.
@@ -30,6 +36,21 @@ class Event:
     size: tuple[float, ...] = ()
     statistic: float = 0.0
     note: str = ""
+
+    @classmethod
+    def of_answers(cls, kind: str, sample: int, answers: Sequence[FaultAnswer]) -> "Event":
+        """Return the event of a diagnosis; the sizes of several faults follow one another."""
+        first = answers[0]
+        sizes = np.concatenate([one.size for one in first.faults])
+        sizes = sizes if np.isfinite(sizes).all() else sizes[:0]  # not known at the ends of the samples
+        note = "more than one fault" if all(len(one.faults) > 1 for one in answers) else ""
+        return cls(kind, sample, tuple((one.label, one.posterior) for one in answers), first.faults[0].onset,
+                   tuple(sizes.tolist()), first.gain, note)
+
+    @property
+    def isolates(self) -> bool:
+        """Whether candidates are named, or none is left."""
+        return self.kind == "isolated"
 
     @property
     def ends_fault(self) -> bool:

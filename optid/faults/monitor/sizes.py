@@ -13,10 +13,11 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.errors import DataError
+from optid.errors import DataError, StructureError
 from optid.faults.diagnosis.alternatives import family_of, split_by_kind
-from optid.faults.diagnosis.answers import Estimate
+from optid.faults.diagnosis.answers import Estimate, FaultAnswer
 from optid.faults.diagnosis.counting import with_model_uncertainty
+from optid.faults.diagnosis.diagnosing import diagnose
 from optid.faults.diagnosis.posterior import Explanation, estimates, several, single
 from optid.faults.monitor.events import Carried
 from optid.faults.nuisance import ModelUncertainty
@@ -90,26 +91,57 @@ class Recent:
         found = [one for label in families for one in self._explanations({label: onset}, listed, now)]
         return {one.candidates[0].label: one.log_evidence for one in found if one.candidates[0].label in labels}
 
-    def _explanations(self, faults: dict[str, int], listed: Sequence[Candidate], now: int) -> list[Explanation]:
-        """Return the explanations of the samples before `now` by faults, in all kinds of broken actuators."""
+    def answers(self, listed: Sequence[Candidate], now: int) -> tuple[FaultAnswer, ...] | None:
+        """Return the answers of a diagnosis of the samples before `now`, by two faults where no single one fits.
+
+        Onsets are samples of the stream. It is empty where nothing explains the samples, None where they are unusable.
+        """
+        part, first = self._part(now)
+        try:
+            if part is None:
+                return None
+            found = diagnose(self.known.model, part, self._dictionary([self._own(one) for one in listed]),
+                             model_uncertainty=self.known)
+        except (DataError, StructureError):  # too few samples, or channels that are no channels of the model any more
+            return None
+        return tuple(replace(one, faults=tuple(replace(fault, onset=fault.onset + first) for fault in one.faults))
+                     for one in found.candidates)
+
+    def _part(self, now: int) -> tuple[Data | None, int]:
+        """Return the last samples before `now` with all inputs, and the number of the first one."""
         first = max(now - WINDOWS * self.window, self.first)
         u, y = (rows[first - self.first : now - self.first] for rows in (self.u, self.y))
         gaps = np.flatnonzero(np.isnan(u).any(axis=1))
-        start = int(gaps[-1]) + 1 if gaps.size else 0
-        model = self.known.model
-        onsets = [max(onset - first - start, 0) for onset in faults.values()]
+        start, model = int(gaps[-1]) + 1 if gaps.size else 0, self.known.model
+        if len(u) - start < 2 * model.nx + 2:
+            return None, first + start
+        return Data(u[start:], y[start:], model.dt, model.inputs, model.outputs), first + start
+
+    def _own(self, one: Candidate) -> Candidate:
+        """Return a candidate without the states that shape the noise of the monitor."""
+        return replace(one, into_state=one.into_state[: self.known.model.nx])
+
+    def _dictionary(self, candidates: Sequence[Candidate]) -> Dictionary:
+        sines = np.full((len(candidates), len(candidates)), np.nan)
+        return Dictionary(self.known.model, self.known.predictor, tuple(candidates), {}, sines)
+
+    def _explanations(self, faults: dict[str, int], listed: Sequence[Candidate], now: int) -> list[Explanation]:
+        """Return the explanations of the samples before `now` by faults, in all kinds of broken actuators."""
+        model, (part, first) = self.known.model, self._part(now)
+        if part is None or not 0 < len(faults) <= MOST:
+            return []
+        onsets = [max(onset - first, 0) for onset in faults.values()]
         families = {label: family_of(one) for one in listed for label in (one.label, family_of(one).label)}
-        chosen = [replace(families[label], into_state=families[label].into_state[: model.nx]) for label in faults]
+        chosen = [self._own(families[label]) for label in faults]
         try:
-            count, _ = usable_samples(model, u[start:])
-            if not chosen or len(chosen) > MOST or max(onsets) + model.nx + 2 > count:
+            count, _ = usable_samples(model, part.u)
+            if max(*onsets, model.nx) + model.nx + 2 > count:
                 return []
-            part = Data(u[start : start + count], y[start : start + count], model.dt, model.inputs, model.outputs)
+            part = part.window(0, count)
             white: Any = whiten(model, part, uncertainty=self.known)
         except DataError:
             return []
-        sines = np.full((len(chosen), len(chosen)), np.nan)
-        search = scan(Dictionary(model, self.known.predictor, tuple(chosen), {}, sines), white, part.u)
+        search = scan(self._dictionary(chosen), white, part.u)
         if len(chosen) > 1:
             return split_by_kind(several(search, chosen, onsets, 1), listed)
         search.statistic[:, np.abs(np.arange(count) - onsets[0]) > NEAR] = np.nan

@@ -63,7 +63,9 @@ class Schedule:
             lines.append(f"  binding: {', '.join(self.active)}")
         if self.promise is not None:
             refusal = self.promise.refusal
+            seen = ", ".join(f"{one.name} from {one.seen[0]:.4g} to {one.seen[1]:.4g}" for one in self.values)
             lines.append(f"  not offered: {refusal}" if refusal else f"  {self.promise}")
+            lines += [f"  as long as the inputs stay where they were: {seen}"] * bool(seen and not refusal)
         lines += [f"  {name}: {np.array2string(size, precision=4)}" for name, size in self.offsets.items()]
         return "\n".join([*lines, *(str(values) for values in self.values)])
 
