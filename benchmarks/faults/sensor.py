@@ -1,9 +1,9 @@
 """Virtual sensors: their error over the bound, and the table of errors of the lost, noise-free output.
 
 One sensor of the standard plant is lost. Root mean square errors over 20 records of 1,500 samples, each method on the
-same records: the Kalman filter on the other sensor, the simulation, the conditional mean learnt from 300, 1,000 and
-4,000 healthy samples, and the projection onto a basis that PAST has tracked. The bound is what the Riccati equation of
-the filter predicts.
+same records: the Kalman filter on the other sensor, the simulation, the conditional mean and the subspace projection
+learnt from 300, 1,000 and 4,000 healthy samples, and the projection onto a basis that PAST has tracked. The bound is
+what the Riccati equation of the filter predicts.
 
     python benchmarks/faults/sensor.py [--runs 20]
 """
@@ -14,7 +14,7 @@ import numpy as np
 from plants import levels, standard_plant
 
 from optid import Data
-from optid.faults import conditional_mean, observer, trajectory
+from optid.faults import conditional_mean, observer, subspace_projection, trajectory
 from optid.identify.tracking import SubspaceTracker
 
 SAMPLES, SETTLED, LENGTHS, LAGS = 1500, 50, (300, 1000, 4000), 8
@@ -63,8 +63,8 @@ def main() -> None:
             for length in LENGTHS:
                 w = levels(length, 900 + run)
                 healthy = Data(w, trajectory(plant, w, seed=3000 + run, x0="rest").y)
-                learnt = conditional_mean(plant, healthy, [name])
-                estimates[f"conditional mean {length}"] = learnt.estimate(record)[:, 0]
+                for word, learn in (("conditional mean", conditional_mean), ("subspace", subspace_projection)):
+                    estimates[f"{word} {length}"] = learn(plant, healthy, [name]).estimate(record)[:, 0]
                 estimates[f"PAST {length}"] = tracked(plant, healthy, record, lost)
             for word, values in estimates.items():
                 squares.setdefault(word, []).append(float(np.mean((values - clean)[SETTLED:] ** 2)))

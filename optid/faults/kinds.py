@@ -219,7 +219,7 @@ class NoiseKind(UnsignedKind):
 
     noise: bool = True
     size_word: str = "standard deviation"
-    without_course: str = "noise has no course"
+    without_course: str = "noise has no course (see noise_test)"
 
     def simulate(self, fault: Any, plant: Any) -> None:
         """Add the noise along its place."""

@@ -1,4 +1,4 @@
-"""Thresholds that keep the time between false alarms asked for."""
+"""Run lengths: the CUSUM table, simulated charts, and thresholds that keep the time between false alarms asked for."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,28 @@ from fault_plants import levels
 from test_monitor import everything, plant
 
 from optid.errors import DataError, StructureError
-from optid.faults import Monitor, dictionary, inject
+from optid.faults import Monitor, cusum_arl, dictionary, inject
 from optid.faults.monitor.arl import Calibration, equalised, tail
+
+
+@pytest.mark.parametrize("shift, arl", [(0.0, 465.4), (0.5, 38.0), (1.0, 10.38), (2.0, 4.01)])
+def test_the_table_of_run_lengths(shift, arl):
+    assert cusum_arl(shift) == pytest.approx(arl, rel=1e-2)
+
+
+def test_run_lengths_against_simulated_charts():
+    rng = np.random.default_rng(0)
+    sums, steps, ends = np.zeros(4000), 0, []
+    while sums.size:
+        sums = np.maximum(0, sums + rng.standard_normal(sums.size) + 0.3 - 0.4)
+        steps += 1
+        ends += [steps] * int(np.sum(sums > 2.5))
+        sums = sums[sums <= 2.5]
+    found = cusum_arl(0.3, 0.4, 2.5, two_sided=False)
+    assert np.mean(ends) == pytest.approx(found, abs=4 * np.std(ends) / np.sqrt(len(ends)))
+    assert cusum_arl(0.0, two_sided=False) == pytest.approx(2 * cusum_arl(0.0), rel=1e-12)
+    with pytest.raises(StructureError, match="h=0"):
+        cusum_arl(0.0, h=0)
 
 
 def test_equalised_thresholds_have_the_rate_asked_for():

@@ -39,6 +39,9 @@ RUNS = 4
 COMMON = 0.1
 """Share of blocks by whose energies a healthy record is compared with the simulation."""
 
+NODES = 80
+"""Nodes of the quadrature, for ten digits of the run lengths of the usual charts."""
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
@@ -179,3 +182,34 @@ def tail(column: Array, level: float) -> float:
     start = ordered[count - base - 1]
     scale = float(np.mean(ordered[count - base :] - start))
     return float(start + scale * np.log(base / exceed))
+
+
+def cusum_arl(shift: float, k: float = 0.5, h: float = 5.0, *, two_sided: bool = True) -> float:
+    """Return the mean number of samples until S = max(0, S + x - k) exceeds h, for x ~ N(shift, 1) and S = 0 at first.
+
+    The integral equation of E. S. Page (Biometrika 41, 1954) is solved by Gauss-Legendre quadrature. The rates of the
+    two sides of a two-sided chart add up (K. W. Kemp, J. R. Stat. Soc. B 23, 1961).
+
+    Args:
+        shift: mean of the samples, in standard deviations; 0 gives the time between false alarms.
+        k: reference value.
+        h: threshold.
+        two_sided: whether -x is charted, too.
+
+    Raises:
+        StructureError: a threshold that is not positive.
+    """
+    if not (np.isfinite(h) and h > 0 and np.isfinite(k) and np.isfinite(shift)):
+        raise StructureError(f"shift={shift!r}, k={k!r}, h={h!r}: they must be finite, and h positive.")
+    if two_sided:
+        return 1 / sum(1 / cusum_arl(mean, k, h, two_sided=False) for mean in (shift, -shift))
+    from scipy.special import ndtr
+
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    nodes, weights = (nodes + 1) * h / 2, weights * h / 2
+    starts = np.concatenate([[0.0], nodes])  # the sum may stay at zero, which has its own probability
+    kernel = np.empty((starts.size, starts.size))
+    kernel[:, 0] = ndtr(k - starts - shift)
+    step = nodes[None, :] - starts[:, None] + k - shift
+    kernel[:, 1:] = weights * np.exp(-(step**2) / 2) / np.sqrt(2 * np.pi)
+    return float(np.linalg.solve(np.eye(starts.size) - kernel, np.ones(starts.size))[0])

@@ -2,7 +2,7 @@
 
 The filter on the remaining sensors is optimal for a known plant, and its Riccati equation predicts its error. Without
 a reliable model the conditional mean of the lost reading, given the last readings of the others and the last inputs, is
-estimated from healthy data.
+estimated from healthy data; the projection onto their signal subspace is the same without weighting by the noise.
 """
 
 from collections.abc import Sequence
@@ -174,6 +174,7 @@ class LearntSensor:
 
     model: "HammersteinSS"  # gives the nonlinearities of the inputs and the names
     lost: tuple[str, ...]  # names of the outputs that are estimated
+    method: str  # "conditional mean" or "subspace"
     lags: int  # samples of the past, the present one included
     weights: Array  # (features, lost) acting on [other readings; f(u)] of every lag, the newest first
     constant: Array  # (lost,)
@@ -210,28 +211,56 @@ def conditional_mean(model: "HammersteinSS", data: Data, lost: Sequence[str], *,
         LookupFailed: an unknown output.
         StructureError: no output is named.
     """
+    names, rows, readings = _learning(model, data, lost, lags, 2)
+    readings = readings[:, : len(names)]
+    mean, level = rows.mean(axis=0), readings.mean(axis=0)
+    weights = np.linalg.lstsq(rows - mean, readings - level, rcond=1e-10)[0]
+    rest = readings - level - (rows - mean) @ weights
+    count, free = len(rows), rows.shape[1] + 1
+    residual = np.sqrt(np.sum(rest**2, axis=0) / (count - free) * (1 + free / count))
+    return LearntSensor(model, names, "conditional mean", lags, weights, level - mean @ weights, residual)
+
+
+def subspace_projection(
+    model: "HammersteinSS", data: Data, lost: Sequence[str], *, lags: int = LAGS, rank: int | None = None
+) -> LearntSensor:
+    """Learn a lost sensor from healthy data: the point of the signal subspace that agrees with the other channels.
+
+    Arguments as in `conditional_mean`, as are the errors raised; `rank` is the dimension of the subspace, lags times
+    the inputs and the states by default.
+    """
+    names, rows, readings = _learning(model, data, lost, lags, 1)
+    everything, width, count = np.hstack([rows, readings]), rows.shape[1], len(names)
+    mean = everything.mean(axis=0)
+    axes = np.linalg.svd(everything - mean, full_matrices=False)[2]
+    basis = axes[: rank or lags * len(model.nonlinearities) + model.nx].T
+    weights = np.linalg.pinv(basis[:width]).T @ basis[width : width + count].T
+    constant = mean[width : width + count] - mean[:width] @ weights
+    residual = np.std(readings[:, :count] - rows @ weights - constant, axis=0)
+    return LearntSensor(model, names, "subspace", lags, weights, constant, residual)
+
+
+def _learning(model: "HammersteinSS", data: Data, lost: Sequence[str], lags: int, per_weight: int
+              ) -> tuple[tuple[str, ...], Array, Array]:
+    """Names of the lost, and complete windows of a healthy record: as `_stacked`."""
     names = _names(model, lost)
     if not names:
         raise StructureError("No lost sensor is named.")
     found = [_stacked(model, part.u, part.y, names, lags) for part in in_units_of(model, data).experiments]
     rows, readings = (np.vstack(parts) for parts in zip(*found))
     complete = ~(np.isnan(rows).any(axis=1) | np.isnan(readings).any(axis=1))
-    count, free = int(complete.sum()), rows.shape[1] + 1
-    if count < 2 * free:
-        raise DataError(f"{count} complete windows of {lags} samples do not determine {free} weights: at least "
-                        f"{2 * free + lags} healthy samples are needed, or fewer lags.")
-    rows, readings = rows[complete], readings[complete]
-    mean, level = rows.mean(axis=0), readings.mean(axis=0)
-    weights = np.linalg.lstsq(rows - mean, readings - level, rcond=1e-10)[0]
-    rest = readings - level - (rows - mean) @ weights
-    residual = np.sqrt(np.sum(rest**2, axis=0) / (count - free) * (1 + free / count))
-    return LearntSensor(model, names, lags, weights, level - mean @ weights, residual)
+    least = per_weight * (rows.shape[1] + 1)
+    if complete.sum() < least:
+        raise DataError(
+            f"{complete.sum()} complete windows of {lags} samples do not determine {rows.shape[1] + 1} weights: at "
+            f"least {least + lags} healthy samples are needed, or fewer lags.")
+    return names, rows[complete], readings[complete]
 
 
 def _stacked(model: "HammersteinSS", u: Array, y: Array, lost: tuple[str, ...], lags: int) -> tuple[Array, Array]:
-    """[other readings; f(u)] of every lag, the newest first, (N - lags + 1, p), and the lost readings."""
+    """[other readings; f(u)] and the lost readings of every lag, the newest first, (N - lags + 1, p)."""
     gone = np.isin(model.outputs, lost)
     count = max(len(y) - lags + 1, 0)
+    starts = [max(lags - 1 - lag, 0) for lag in range(lags)]
     signal = np.hstack([y[:, ~gone], model.expand_inputs(u)])
-    rows = [signal[start : start + count] for start in range(lags - 1, -1, -1)] if count else [signal[:0]] * lags
-    return np.hstack(rows), y[len(y) - count :, gone]
+    return tuple(np.hstack([part[k : k + count] for k in starts]) for part in (signal, y[:, gone]))  # type: ignore
