@@ -17,6 +17,7 @@ from optid.arrays import check_integer, one_of
 from optid.errors import StructureError
 from optid.lazy import public_names
 
+ORDER = 4  # of the filter of noise
 Spectrum = Sequence[float] | np.ndarray | Callable[[np.ndarray], np.ndarray] | None
 
 
@@ -126,14 +127,13 @@ def chirp(n: int, low: float = -1.0, high: float = 1.0, *, f0: float, f1: float,
 
 
 def band_limited_noise(n: int, low: float = -1.0, high: float = 1.0, *, cutoff: float | tuple[float, float],
-                       dt: float = 1.0, order: int = 4, clip: float = 2.5, seed: int = 0) -> np.ndarray:
-    """Return white Gaussian noise through a Butterworth filter, clipped to low to high.
+                       dt: float = 1.0, clip: float = 2.5, seed: int = 0) -> np.ndarray:
+    """Return white Gaussian noise through a Butterworth filter of order 4, clipped to low to high.
 
     The filter runs in before the record starts, so that the record is stationary.
 
     Further arguments:
         cutoff: edge of a low-pass, or the edges of a band-pass (1/unit of dt), below half the sampling rate.
-        order: order of the filter.
         clip: number of standard deviations that reach from the middle to low and to high.
     """
     from scipy.signal import butter, sosfilt
@@ -144,12 +144,12 @@ def band_limited_noise(n: int, low: float = -1.0, high: float = 1.0, *, cutoff: 
         raise StructureError(f"cutoff = {cutoff}: one positive frequency, or two in rising order.")
     if edges[-1] >= 0.5 / dt:
         raise StructureError(f"cutoff = {cutoff}: it must lie below half the sampling rate, {0.5 / dt:g}.")
-    if not clip > 0 or order < 1:
-        raise StructureError(f"clip = {clip} and order = {order}: both must be positive.")
+    if not clip > 0:
+        raise StructureError(f"clip = {clip}: it must be positive.")
     kind = "lowpass" if edges.size == 1 else "bandpass"
-    sections = butter(order, edges if edges.size == 2 else edges[0], kind, fs=1.0 / dt, output="sos")
+    sections = butter(ORDER, edges if edges.size == 2 else edges[0], kind, fs=1.0 / dt, output="sos")
     # About fifty time constants of the slowest pole.
-    run_in = int(np.ceil(5 * order / (dt * float(np.min(np.diff([0.0, *edges]))))))
+    run_in = int(np.ceil(5 * ORDER / (dt * float(np.min(np.diff([0.0, *edges]))))))
     noise = np.asarray(sosfilt(sections, np.random.default_rng(seed).standard_normal(run_in + n)))[run_in:]
     # The deviation of the process, not of this record: records of one design then share one scale.
     deviation = float(np.linalg.norm(np.asarray(sosfilt(sections, np.eye(1, run_in)[0]))))
