@@ -17,55 +17,91 @@ TERMS = 24  # of a series, at most, for a norm of one
 
 
 @cached_njit
-def exponential(F, h):  # noqa: N803 - the field's letter
-    """Return exp(F h), found by scaling, a Taylor series and squaring."""
-    doublings, size = 0, np.sum(np.abs(F), axis=1).max() * h
-    while size > 0.5:
-        size, doublings = size / 2.0, doublings + 1
-    term, found = np.eye(len(F)), np.eye(len(F))
-    for order in range(1, 18):
-        term = F @ term * (h / 2.0**doublings / order)
-        found += term
-    for _ in range(doublings):
-        found = found @ found
-    return found
+def _product(left, right, into):
+    """Multiply square matrices."""
+    n = len(left)
+    for i in range(n):
+        for j in range(n):
+            into[i, j] = 0.0
+        for k in range(n):
+            if left[i, k] != 0.0:
+                for j in range(n):
+                    into[i, j] += left[i, k] * right[k, j]
 
 
 @cached_njit
-def _multiply(E, z, into):  # noqa: N803
-    for i in range(len(into)):
-        for c in range(z.shape[1]):
+def exponential(F, h, found):  # noqa: N803 - the field's letter
+    """Write exp(F h), found by scaling, a Taylor series and squaring."""
+    n = len(F)
+    size = 0.0
+    for i in range(n):
+        row = 0.0
+        for j in range(n):
+            row += abs(F[i, j])
+        size = max(size, row * h)
+    doublings = 0
+    while size > 0.5:
+        size /= 2.0
+        doublings += 1
+    part = h / 2.0**doublings
+    term, following = np.zeros((n, n)), np.zeros((n, n))
+    for i in range(n):
+        for j in range(n):
+            term[i, j] = found[i, j] = 1.0 if i == j else 0.0
+    for order in range(1, 18):
+        _product(F, term, following)
+        for i in range(n):
+            for j in range(n):
+                term[i, j] = following[i, j] * (part / order)
+                found[i, j] += term[i, j]
+    for _ in range(doublings):
+        _product(found, found, following)
+        for i in range(n):
+            for j in range(n):
+                found[i, j] = following[i, j]
+
+
+@cached_njit
+def _apply(E, z, into):  # noqa: N803
+    n, m = z.shape
+    for i in range(n):
+        for c in range(m):
             total = 0.0
-            for k in range(len(z)):
+            for k in range(n):
                 total += E[i, k] * z[k, c]
             into[i, c] = total
+    for i in range(n):
+        for c in range(m):
+            z[i, c] = into[i, c]
 
 
 @cached_njit
 def _series(F, h, norm, z, term, into):  # noqa: N803
     """Move the state by the series of exp(F h), in steps of norm one."""
+    n, m = z.shape
     steps = max(1, int(np.ceil(norm * h)))
+    g = h / steps
     for _ in range(steps):
-        term[:] = z
+        for i in range(n):
+            for c in range(m):
+                term[i, c] = z[i, c]
         for order in range(1, TERMS):
-            _multiply(F, term, into)
             largest, reached = 0.0, 0.0
-            for i in range(len(z)):
-                for c in range(z.shape[1]):
-                    term[i, c] = into[i, c] * (h / steps / order)
-                    z[i, c] += term[i, c]
-                    largest = max(largest, abs(term[i, c]))
+            for i in range(n):
+                for c in range(m):
+                    total = 0.0
+                    for k in range(n):
+                        if F[i, k] != 0.0:
+                            total += F[i, k] * term[k, c]
+                    into[i, c] = total * (g / order)
+            for i in range(n):
+                for c in range(m):
+                    term[i, c] = into[i, c]
+                    z[i, c] += into[i, c]
+                    largest = max(largest, abs(into[i, c]))
                     reached = max(reached, abs(z[i, c]))
             if largest <= 1e-18 * reached:
                 break
-
-
-@cached_njit
-def _find(lengths, h, close):
-    for one in range(SLOTS):
-        if abs(lengths[one] - h) <= close:
-            return one
-    return -1
 
 
 @cached_njit
@@ -86,22 +122,30 @@ def run(F, C, instants, changes, inputs, sides, start):  # noqa: N803
         (N, o, M).
     """
     straight, late = sides
-    n, m, count = len(F), inputs.shape[1], len(instants)
-    out, z, into, term = np.zeros((count, len(C), m)), start.copy(), np.zeros((n, m)), np.zeros((n, m))
+    n, m, outputs, count = len(F), inputs.shape[1], len(C), len(instants)
+    out, z, into, term = np.zeros((count, outputs, m)), start.copy(), np.zeros((n, m)), np.zeros((n, m))
     kept, lengths, recent = np.zeros((SLOTS, n, n)), np.full(SLOTS, -1.0), np.full(SLOTS, -1.0)
-    if not count or not len(changes):
-        return out
-    used, noted, norm = 0, 0, np.sum(np.abs(F), axis=1).max()
-    # a few times the rounding of a difference of two times
-    close = 1e-15 * max(abs(instants[0]), abs(instants[-1]), abs(changes[0]), abs(changes[-1]))
+    used, noted, norm, largest = 0, 0, 0.0, 0.0
+    for i in range(n):
+        row = 0.0
+        for j in range(n):
+            row += abs(F[i, j])
+        norm = max(norm, row)
+    if count:
+        largest = max(abs(instants[0]), abs(instants[-1]))
+    if len(changes):
+        largest = max(largest, abs(changes[0]), abs(changes[-1]))
+    close = 1e-15 * largest  # a few times the rounding of a difference of two times
     k = 0
     while k < count and (instants[k] < changes[0] - close or (not late and instants[k] <= changes[0] + close)):
         k += 1
     for j in range(len(changes)):
         now, last = changes[j], j + 1 == len(changes)
-        z[0], z[1] = inputs[j], 0.0
-        if straight and not last:
-            z[1] = (inputs[j + 1] - inputs[j]) / (changes[j + 1] - changes[j])
+        for c in range(m):
+            z[0, c] = inputs[j, c]
+            z[1, c] = 0.0
+            if straight and not last:
+                z[1, c] = (inputs[j + 1, c] - inputs[j, c]) / (changes[j + 1] - changes[j])
         while True:
             reads = k < count and (last or instants[k] < changes[j + 1] - close or (
                 not late and instants[k] <= changes[j + 1] + close))
@@ -110,23 +154,34 @@ def run(F, C, instants, changes, inputs, sides, start):  # noqa: N803
             to = instants[k] if reads else changes[j + 1]
             h = to - now
             if h > close:
-                slot = _find(lengths, h, close)
+                slot = -1
+                for one in range(SLOTS):
+                    if abs(lengths[one] - h) <= close:
+                        slot = one
+                        break
                 if slot < 0:
-                    if norm * h > REACH or _find(recent, h, close) >= 0:
+                    again = norm * h > REACH
+                    for one in range(SLOTS):
+                        again = again or abs(recent[one] - h) <= close
+                    if again:
                         slot, used = used, (used + 1) % SLOTS
-                        kept[slot] = exponential(F, h)
+                        exponential(F, h, kept[slot])
                         lengths[slot] = h
                     else:
                         recent[noted], noted = h, (noted + 1) % SLOTS
                 if slot >= 0:
-                    _multiply(kept[slot], z, into)
-                    z[:] = into
+                    _apply(kept[slot], z, into)
                 else:
                     _series(F, h, norm, z, term, into)
                 now = to
             if not reads:
                 break
-            _multiply(C, z, out[k])
+            for o in range(outputs):
+                for c in range(m):
+                    total = 0.0
+                    for i in range(n):
+                        total += C[o, i] * z[i, c]
+                    out[k, o, c] = total
             k += 1
     return out
 

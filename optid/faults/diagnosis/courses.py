@@ -4,22 +4,15 @@ The additions of a frozen sensor are spanned by impulses of that sensor at all s
 orthogonal factorisation, from the last sample backwards, gives the energy explained for every onset. The marginal
 likelihood penalises as many magnitudes. The readings must be constant within the noise of the sensor.
 
-White noise of variance rho at a place adds rho H H' to the covariance of the whitened innovations, H being their
-responses to impulses there at all samples from the onset on. With the eigenvalues s of H H' and the coordinates z of
-the window along its eigenvectors the log-likelihood is a function of one number,
-
-    l(rho) = -1/2 sum( log(1 + rho s_i) + z_i² / (1 + rho s_i) ),
-
-and is averaged over rho on a logarithmic scale.
+Additional noise of variance rho at a place adds rho H H' to the covariance of the innovations. Its likelihood is
+averaged over rho on a logarithmic scale.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array
 from optid.data.record import Experiment
-from optid.faults.consistency.waveforms import RANK, by_place, waveform_matrix
+from optid.faults.consistency.noise_changes import noise_search
+from optid.faults.consistency.waveforms import waveform_matrix
 from optid.faults.diagnosis.posterior import NEGLIGIBLE, Explained, Explanation, marginal
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened
@@ -38,19 +31,6 @@ VARIANCES = np.geomspace(1e-2, 1e4, 61)
 
 ONSETS = 12
 """Onsets of an added noise tried over the record, and again around the best of them."""
-
-
-class NoisePlace(NamedTuple):
-    """A place where noise may have increased since an onset."""
-
-    label: str
-    axes: Array  # (N l, q) eigenvectors of H H'
-    s: Array  # (q,) its eigenvalues
-
-    def likelihood(self, rho: Array, z2: Array) -> Array:
-        """Return l(rho) - l(0), (K,), of variances rho (K,), for squared coordinates z2 (q,) of a window."""
-        grown = 1 + rho[:, None] * self.s
-        return np.asarray(-0.5 * (np.sum(np.log(grown), axis=1) + (1 / grown - 1) @ z2))
 
 
 def without_signature(found: Dictionary) -> tuple[list[Candidate], list[Candidate]]:
@@ -114,10 +94,11 @@ def _noises(found: Dictionary, noises: list[Candidate], white: Whitened) -> list
     prepared = {}
 
     def attempt(onset: int) -> None:
-        for place in noise_places(found, noises, white, onset):
-            z2 = (place.axes.T @ white.r.ravel()) ** 2
+        search = noise_search(found, white, onset=onset, free_start=False)
+        for place in search.places:
+            z2 = ((place.axes.T @ white.r.ravel()) ** 2)[None]
             grid = VARIANCES / float(np.mean(place.s))
-            values = place.likelihood(grid, z2)
+            values = place.likelihood(grid, z2)[0]
             total = float(np.asarray(logsumexp(values))) - np.log(grid.size)
             weights = np.exp(values - values.max())
             weights /= weights.sum()
@@ -158,14 +139,3 @@ def _noises(found: Dictionary, noises: list[Candidate], white: Whitened) -> list
             course=rest,
         ).without_negligible_onsets())
     return explanations
-
-
-def noise_places(found: Dictionary, noises: list[Candidate], white: Whitened, onset: int) -> list[NoisePlace]:
-    """Return the places of noises whose responses, from an onset on, reach a reading of the window."""
-    places = []
-    for candidate, *_ in by_place(noises).values():
-        axes, values, _ = np.linalg.svd(waveform_matrix(found, candidate, white, onset), full_matrices=False)
-        kept = values > RANK * max(float(values.max(initial=0.0)), 1e-300)
-        if kept.any() and values[0] > 0:
-            places.append(NoisePlace(candidate.label, axes[:, kept], values[kept] ** 2))
-    return places
