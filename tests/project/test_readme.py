@@ -1,6 +1,7 @@
 """The outputs printed in the README and the documentation are what the commands print, whatever the processor."""
 
 import re
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
@@ -40,11 +41,13 @@ def output(*words: object) -> str:
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    path = tmp_path_factory.mktemp("model") / "thruster.json"
-    output("fit", "--example", "thruster", "--formulation", "hammerstein_ss.exact", "--nx", 2, "--set",
-           "criterion=prediction", "--model", path)
-    return path
+def tanks(tmp_path_factory):
+    """The folder of the page on faults after its script and its first command."""
+    folder, text = tmp_path_factory.mktemp("tanks"), (HOME / "docs" / "faults.md").read_text(encoding="utf-8")
+    with chdir(folder):
+        exec(re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0], {})
+        output(*re.findall(r"^    optid (fit (?:.*\\\n)*.*)$", text, re.M)[0].replace("\\\n", " ").split())
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -89,14 +92,13 @@ def test_the_first_command_of_the_readme_prints_that_the_model_is_good(tmp_path)
 
 
 @pytest.mark.slow
-def test_the_sizes_of_isolable_faults_are_those_of_the_readme(model):
-    assert figures(output("isolability", model)) == figures(printed("window 100 samples"))
-
-
-def test_the_diagnosis_is_that_of_the_readme(model, tmp_path):
-    shown = output("diagnose", model, "--example", "broken_thruster", "--identified", "thruster", "--out",
-                   tmp_path / "d.json")
-    assert figures(shown) == figures(printed("faulty: actuator:current loss"))
+@pytest.mark.parametrize(("command", "words"), [
+    ("isolability", "window 100 samples"), ("diagnose", "faulty: actuator:pump")])
+def test_the_outputs_of_the_page_on_faults_are_those_of_its_commands(command, words, tanks):
+    text = (HOME / "docs" / "faults.md").read_text(encoding="utf-8")
+    with chdir(tanks):
+        shown = output(*re.findall(rf"^    optid ({command} .*)$", text, re.M)[0].split())
+    assert figures(shown) == figures(printed(words))
 
 
 @pytest.mark.slow
