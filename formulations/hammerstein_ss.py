@@ -12,22 +12,14 @@ from projections of block Hankel matrices; (A, C) from its shift invariance, wit
     min over x0, ...: ‖R [x0; offset; vec Theta_1; ...] - s‖²,    Theta_i = mu_i [B_i; D_i]ᵀ
 
 P is definite with trace n, and any `Rule` about poles that is a linear matrix inequality in P and Q = A P takes part
-(Miller and de Callafon 2013). R and s are the record, compressed. The last step is either
-
-* factored: every channel is rank one; certified by the machinery of rank-one blocks. Named variables: ``x0``,
-  ``offset``, ``mu``, ``b`` (= [B_i; D_i]) and, for an output that is fed back, ``mu feedback``, ``b feedback``;
-* or lumped: ``Theta_i`` as it comes, convex; the factors are split off afterwards in the metric of the least squares.
-  Named variables: ``x0``, ``offset``, ``Theta``, ``Theta feedback``. Linear channels alone always take this form.
+(Miller and de Callafon 2013). R and s are the record, compressed. The last step is either factored, every channel rank
+one and certified as such, in ``x0``, ``offset``, ``mu``, ``b`` (= [B_i; D_i]) and, for an output that is fed back, ``mu
+feedback``, ``b feedback``; or lumped, ``Theta_i`` as it comes, convex, the factors split off afterwards in the metric
+of the least squares, in ``x0``, ``offset``, ``Theta``, ``Theta feedback``. Linear channels alone always take this form.
 
 With several inputs the per-channel names carry the input, as in ``mu[valve]``. Constraints may use in either form
 ``Theta`` (P, n + l), the lumped ``Bu`` (n, p), ``Du`` (l, p) and ``Ez`` (n, q); where every channel is linear ``B``
 (n, m) and ``D`` (l, m) too. ``reference`` of the view holds A and C.
-
-* `sid`: past inputs and outputs as instruments (MOESP; Verhaegen and Dewilde 1992), for open loop.
-* `sivid`: instrumental variables with nonlinear feedback, singular regressors by pseudo-inverse (Luo and
-  Leonessa 2008).
-* `asivid`: instruments augmented by future inputs and by the feedback functions of simulated, noise-free outputs, which
-  keeps the regressors regular and the estimate consistent under coloured noise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -58,8 +50,7 @@ Feedback = Bases | None | Sequence[Bases | None]  # one basis for all outputs, o
 def _shift(step: ShiftStep, rules: Sequence[Rule], given: tuple[np.ndarray, np.ndarray] | None = None) -> Problem:
     """Return min ‖residual‖ under rules: in P and Q, weighted by P; with P and a start for A given, in A alone.
 
-    The model is A. The norm rather than its square: where a plant obeys almost exactly, the square would vanish in the
-    tolerance.
+    The model is A. Where a plant obeys almost exactly, the square of the norm would vanish in the tolerance.
     """
     n = len(step.basis)
     common: dict[str, Any] = {"model": step.recover, "facts": {"reference": {"A": step.free}}, "scale": step.size}
@@ -120,27 +111,25 @@ def sid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, ba
         noise: Noise = "white", weighting: str = "moesp", offset: bool = True,
         feedthrough: bool | Sequence[bool] = True, observer: str = "auto", split: str = "exact",
         stability: str = "auto", constraints: Sequence[Any] = ()) -> Procedure:
-    """Identify an open-loop system from projections on past inputs and outputs.
+    """Identify an open-loop system from projections on past inputs and outputs (Verhaegen and Dewilde 1992).
 
     Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``.
 
     Args:
         data: the record.
-        nx: order; "auto" for the smallest order after which the singular values are noise (`optid.identify.order`),
-            "gap" for the largest gap between them (SLICOT's rule).
-        block_rows: block rows of the future, and as many of the past; more than the order. None chooses; where missing
-            outputs then leave few complete windows, they are estimated (`optid.identify.subspace.imputation`), for the
-            choice of A and C only.
+        nx: order; "auto" for the least after which singular values are noise, "gap" for their largest gap (SLICOT).
+        block_rows: block rows of the future, and as many of the past; more than the order. None chooses, and for A and
+            C estimates missing outputs that leave few complete windows (`optid.identify.subspace.imputation`).
         basis: basis of the input nonlinearity, one per input or one for all; linear by default.
-        noise: "white" uses past outputs as instruments (less variance; process noise may be present), "coloured" inputs
-            alone (consistent under coloured measurement noise).
-        weighting: weighting of the singular values: "moesp", "cva" or "plain" (`optid.identify.subspace.projection`),
-            or "best" for the one whose (A, C) leaves the smallest error on the record.
+        noise: "white" has past outputs as instruments, for less variance, also under process noise; "coloured" inputs
+            alone, consistent under coloured measurement noise.
+        weighting: of the singular values, "moesp", "cva" or "plain" (see `optid.identify.subspace.projection`); "best" is
+            the one whose (A, C) leaves the smallest error.
         offset: estimate a constant; False takes the record as it is.
         feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
         observer: for the step in B, D and x0: "none" minimises the simulation error, "kalman" a prediction error,
             "auto" the first unless A is unstable.
-        split: "exact" keeps every channel rank one in that step (certified), "lumped" splits afterwards (convex).
+        split: "exact" keeps every channel rank one in that step, "lumped" splits afterwards.
         stability: "auto" brings poles of an unstable estimate to modulus 0.999, "free" leaves them.
         constraints: rules about poles and about coefficients; variables as above.
 
@@ -163,8 +152,8 @@ def sivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, 
           stability: str = "auto", constraints: Sequence[Any] = ()) -> Procedure:
     """Identify a system with nonlinear feedback by instrumental variables, singular directions left out.
 
-    With past instruments the correlation of instruments and regressors loses rank as the record grows; the directions
-    below `tolerance` are dropped (pseudo-inverse), which is what distinguishes the method from `asivid`.
+    With past instruments their correlation with the regressors loses rank as the record grows; directions below
+    `tolerance` are dropped by pseudo-inverse (Luo and Leonessa 2008).
 
     Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``. Other arguments as in `sid`.
 
@@ -172,14 +161,10 @@ def sivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, 
         feedback_basis: basis of the feedback, None for no feedback, one for all outputs or one per output.
         instruments: "past", "inputs" or "inputs+past".
         form: "projection" or "correlation".
-        tolerance: singular value of the projected regressors, relative to the largest, below which a direction is
-            dropped.
+        tolerance: singular value of the projected regressors, over the largest, below which a direction is dropped.
 
     Raises:
         StructureError, RankError, DataError: as `sid`; RankError also where the feedback basis is linear in y.
-
-    Warns:
-        DataWarning: the feedback basis is nearly linear in y.
     """
     return SUBSPACE.fit(
         "hammerstein_ss.sivid", data, nx=nx, block_rows=block_rows, basis=basis, feedback_basis=feedback_basis,
@@ -191,27 +176,24 @@ def sivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, 
 def asivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
            feedback_basis: Feedback = None, noise: Noise = "coloured", iterations: int = 2, form: str = "projection",
            weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
-           observer: str = "auto", split: str = "exact", stability: str = "auto",
-           constraints: Sequence[Any] = ()) -> Procedure:
+           observer: str = "auto", split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()
+           ) -> Procedure:
     """Identify a system with nonlinear feedback with instruments augmented by simulated, noise-free feedback.
 
+    They keep the regressors regular and the estimate consistent under coloured noise.
     Named variables: ``Bu``, ``Du``, ``Theta``, ``b``, ``mu``, ``offset``, ``x0``. Other arguments as in `sivid`.
 
     Args:
         noise: "coloured" keeps measured outputs out of the instruments; "white" adds the past of the outputs and of
             their feedback functions.
-        iterations: simulations of the feedback with a preliminary model, each with the model of the one before; 0 uses
-            past and future inputs (and with noise="white" the past outputs) alone.
+        iterations: simulations of the feedback, each with the model of the one before; 0 uses past and future inputs
+            (and with noise="white" the past outputs) alone.
 
     Raises:
-        StructureError, RankError, DataError: as `sivid`.
-
-    Warns:
-        DataWarning: the feedback basis is nearly linear in y; the simulated feedback explains little of the measured.
+        StructureError, RankError, DataError: as `sivid`, with a DataWarning also where simulated feedback says little.
     """
-    kind = "simulated" if iterations else "inputs"
+    kind = ("simulated" if iterations else "inputs") + ("+past" if noise == "white" else "")
     return SUBSPACE.fit(
         "hammerstein_ss.asivid", data, nx=nx, block_rows=block_rows, basis=basis, feedback_basis=feedback_basis,
-        instruments=kind + ("+past" if noise == "white" else ""), form=form, iterations=iterations,
-        weighting=weighting, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
-        stability=stability, constraints=tuple(constraints))
+        instruments=kind, form=form, iterations=iterations, weighting=weighting, offset=offset, feedthrough=feedthrough,
+        observer=observer, split=split, stability=stability, constraints=tuple(constraints))
