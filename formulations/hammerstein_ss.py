@@ -123,8 +123,8 @@ def sid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, ba
         basis: basis of the input nonlinearity, one per input or one for all; linear by default.
         noise: "white" has past outputs as instruments, for less variance, also under process noise; "coloured" inputs
             alone, consistent under coloured measurement noise.
-        weighting: of the singular values, "moesp", "cva" or "plain" (see `optid.identify.subspace.projection`); "best" is
-            the one whose (A, C) leaves the smallest error.
+        weighting: of the singular values, "moesp", "cva" or "plain" (see `optid.identify.subspace.projection`), or
+            "best", whose (A, C) leaves the smallest error.
         offset: estimate a constant; False takes the record as it is.
         feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
         observer: for the step in B, D and x0: "none" minimises the simulation error, "kalman" a prediction error,
