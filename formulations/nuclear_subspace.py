@@ -78,6 +78,6 @@ def low_rank(structured: Structured, weight: float) -> Problem:
 
     return Problem(
         "low rank", matrix.start(), (matrix, misfit), (), structured.decompose,
-        {"units": structured.windows.plan.units}, structured.in_units,
+        {"units": structured.windows.plan.units, "courses": frozenset({"output"})}, structured.in_units,
         scale=weight * float(np.sum(structured.problem.data**2)),
         weights={"weight": weight}, posed=partial(low_rank, structured))

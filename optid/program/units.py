@@ -14,11 +14,6 @@ import numpy as np
 
 from optid.data.channels import Transform
 
-SIGNALS = ("x", "output")  # named courses of the output, one row per sample
-HEIGHTS = (*SIGNALS, "mu", "Theta", "offset", "x0", "states", "B", "Bu", "D", "Du", "Ez", "mu feedback",
-           "Theta feedback", "static")
-"""Named quantities that are proportional to the unit of the outputs; A, C, K and the norm of b have no unit."""
-
 
 def own_units(data: Any, linear: Sequence[bool] = (), centred: bool = True) -> Transform:
     """Return the units in which outputs, and inputs that act linearly, have mean zero and variance one.
@@ -88,25 +83,26 @@ def energy_unit(units: Transform) -> float:
     return units.y_scale[0] ** 2
 
 
-def outward(expressions: Mapping[str, Any], units: Transform, inputs: Sequence[str], states: bool) -> dict[str, Any]:
-    """Return the named expressions of a programme in the units of the record, to which ``units`` leads.
+def outward(view: Any) -> dict[str, Any]:
+    """Return the named expressions of an `optid.program.view.View` in the units of the record.
 
-    The constant of a state-space model (``states``) is that of its output equation.
+    The constant of a state-space model, which has A in its reference, is that of its output equation.
     """
+    expressions, units, inputs = view.inner, view.units, view.channels
     r, found = units.y_scale[0], {}
     for name, expression in expressions.items():
         word, _, channel = name.partition("[")
         alone = word == "b" and "mu" + name[1:] not in expressions  # of an input that acts linearly
-        factor = r if word in HEIGHTS or alone else 1.0
+        factor = r if word in view.heights | view.courses or alone else 1.0
         if factor != 1.0 and word in ("mu", "Theta", "b", "static"):
             channel = channel.rstrip("]")
             factor /= units.u_scale[inputs.index(channel) if channel in inputs else 0]
         found[name] = expression if factor == 1.0 else factor * expression
-        if word in SIGNALS:
+        if word in view.courses:
             level = np.array(units.y_offset)
             found[name] = found[name] + (level[0] if expression.ndim == 1 else np.tile(level, (expression.shape[0], 1)))
     if "offset" in found:
-        found["offset"] = found["offset"] + _level(found, units, inputs, states)
+        found["offset"] = found["offset"] + _level(found, units, inputs, "A" in view.reference)
     return found
 
 

@@ -36,6 +36,8 @@ class View(Mapping[str, cp.Expression]):
         outputs: names of the outputs, where constraints may have to choose one.
         units: from the units of the programme to those of the record, in which the expressions are; None where they
             are the same.
+        heights: words of named quantities that are proportional to the unit of the outputs.
+        courses: words of those that are courses of the outputs, with their levels.
         delays: of the inputs in samples, of a polynomial model.
         iterate: whether the reference is the point where a descent stands, which constraints must not cut off.
     """
@@ -49,6 +51,8 @@ class View(Mapping[str, cp.Expression]):
     reference: Values = field(default_factory=dict)
     outputs: tuple[str, ...] = ()
     units: Transform | None = None
+    heights: frozenset[str] = frozenset()
+    courses: frozenset[str] = frozenset()
     iterate: bool = False
     delays: Mapping[str, int] = field(default_factory=dict)
     _auxiliaries: set[int] = field(default_factory=set, init=False)
@@ -57,7 +61,7 @@ class View(Mapping[str, cp.Expression]):
     def _expressions(self) -> Mapping[str, cp.Expression]:
         if self.units is None:
             return self.inner
-        return outward(self.inner, self.units, self.channels, states="A" in self.reference)
+        return outward(self)
 
     def __getitem__(self, name: str) -> cp.Expression:
         try:

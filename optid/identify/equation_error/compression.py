@@ -69,6 +69,7 @@ class EquationError:
         """Return what constraints may ask besides named expressions: keyword arguments of a `View`."""
         full, inputs = solve_triangular(self.problem.root, self.problem.target), self.layout.inputs
         return {"channels": inputs, "bases": dict(zip(inputs, self.bases)), "gauge": gauge, "units": self.units,
+                "heights": frozenset({"mu", "Theta", "offset"}),
                 "reference": self.linear_part(full[: self.problem.linear]),
                 "delays": dict(zip(inputs, self.layout.nk))}
 

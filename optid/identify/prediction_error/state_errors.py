@@ -37,6 +37,8 @@ WILD = 10.0  # times the range of the record that the run of an iterate must not
 ROUNDING = 1e-9  # share of an interval within which its ends are the same
 FLOOR = 1e-7  # smallest standard deviation of an error that weights may rest on, as a share of that of its output
 DEPENDENT = 1e-12  # smallest eigenvalue of the correlation of errors that can be weighted
+HEIGHTS = frozenset({"mu", "Theta", "offset", "x0", "states", "static", "mu feedback", "Theta feedback"})
+"""Named quantities in the unit of the outputs; A, C, K and the norm of b have none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,7 @@ class StateErrors(Criterion):
         """Return what constraints may ask besides named expressions: keyword arguments of a `View`."""
         x = self.unknowns.expansion
         return {"gauge": self.gauge, "channels": x.input_names, "outputs": x.output_names, "units": self.units,
+                "heights": HEIGHTS, "courses": frozenset({"output"}),
                 "bases": dict(zip(x.input_names, outer_bases(x.inputs, self.units)))}
 
     def model(self, values: Mapping[str, Array], constrained: bool = True) -> HammersteinSS:

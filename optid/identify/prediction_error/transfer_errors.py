@@ -54,6 +54,7 @@ class TransferErrors(TransferPredictor, Criterion):
         """Return what constraints may ask besides named expressions: keyword arguments of a `View`."""
         layout = self.unknowns.layout
         return {"channels": layout.inputs, "gauge": self.gauge, "units": self.units,
+                "heights": frozenset({"mu", "Theta", "offset", "x0"}), "courses": frozenset({"x"}),
                 "bases": dict(zip(layout.inputs, outer_bases(layout.bases, self.units)))}
 
     def model(self, values: Mapping[str, Array], signed: bool = True) -> HammersteinTF:

@@ -27,6 +27,9 @@ from optid.structures.bilinear import starts
 from optid.structures.lifted_regression import leading_pairs
 from optid.structures.rank_one import RankOne
 
+HEIGHTS = frozenset({"mu", "Theta", "offset", "x0", "B", "Bu", "D", "Du", "Ez", "mu feedback", "Theta feedback"})
+"""Named quantities in the unit of the outputs; A, C and the norm of b have none."""
+
 
 class StepMatrices(NamedTuple):
     """What the step estimates: x+ = A x + Bu eta(u) + Ez zeta(y), y = C x + Du eta(u) + d, from x0."""
@@ -108,7 +111,7 @@ class Realisation:
     def facts(self) -> dict[str, Any]:
         """Return what constraints may ask besides named expressions: keyword arguments of a `View`."""
         x, units = self.form.expansion, self.plan.units
-        return {"channels": x.input_names, "outputs": x.output_names, "units": units,
+        return {"channels": x.input_names, "outputs": x.output_names, "units": units, "heights": HEIGHTS,
                 "bases": dict(zip(x.input_names, outer_bases(x.inputs, units))),
                 "gauge": "norm" if self.factored else "", "reference": {"A": self.form.a, "C": self.form.c}}
 
