@@ -86,7 +86,7 @@ def test_gaps_and_several_experiments(weighting):
     for i, (one, other) in enumerate(zip(ours.model.simulate(data, x0="fit"), theirs.model.simulate(data, x0="fit"))):
         assert one == pytest.approx(other, abs=1e-5 * np.abs(other).max())
         course = ours.problem.named_quantities(ours.solution.values)[f"output[{i + 1}]"]
-        assert course == pytest.approx(one, abs=1e-3 * np.abs(one).max())  # the initial state is fitted again there
+        assert course[60:] == pytest.approx(one[60:], abs=1e-5 * np.abs(one).max())  # where initial states play no part
 
 
 @pytest.mark.parametrize("solver", ["uno", "fatrop"])
