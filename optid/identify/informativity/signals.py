@@ -106,7 +106,7 @@ def _without_outliers(outputs: Sequence[Array], inputs: Sequence[Array]) -> list
     return kept
 
 
-def _may_answer(found: Sequence[Array], inputs: Sequence[Array]) -> bool:
+def _may_answer(found: Sequence[NDArray[np.intp]], inputs: Sequence[Array]) -> bool:
     """Whether pulses at these samples of every experiment may be the responses to inputs that move now and then.
 
     They may where an input has pulses itself, or where more of them begin equally long after its moves than by chance.
@@ -115,7 +115,7 @@ def _may_answer(found: Sequence[Array], inputs: Sequence[Array]) -> bool:
     runs, count = sum(map(len, begun)), sum(map(len, inputs))
     for c in range(inputs[0].shape[1]):
         own = [u[:, c] for u in inputs]
-        moves = [np.append(False, np.diff(u) != 0) for u in own]
+        moves: list[NDArray[np.bool_]] = [np.append(False, np.diff(u) != 0) for u in own]
         share = sum(map(np.sum, moves)) / count
         if any(map(_is_pulsed, own)) or any(map(len, find_outliers(own))):
             return True
@@ -130,7 +130,8 @@ def _may_answer(found: Sequence[Array], inputs: Sequence[Array]) -> bool:
 def _is_pulsed(u: Array) -> bool:
     """Whether an input (T,) leaves its usual value for a few samples at a time."""
     values, counts = np.unique(u, return_counts=True)
-    away = np.flatnonzero(np.diff(np.concatenate([[False], u != values[np.argmax(counts)], [False]])))
+    off = np.asarray(u != values[np.argmax(counts)])
+    away = np.flatnonzero(np.diff(np.concatenate([[False], off, [False]])))
     lengths = away[1::2] - away[::2]
     return lengths.size > 0 and int(lengths.max()) <= LONGEST
 
