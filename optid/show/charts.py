@@ -42,9 +42,22 @@ def channel_axis(name: str, unit: str) -> Axis:
 
 
 def time_axis(record: Data, k: int = 0) -> Axis:
-    """Return the axis of time of experiment k, which counts samples too."""
-    title = "time" if record.dated else time_title(record.time_unit)
-    return Axis(title, unit=record.time_unit, dates=record.dated, start=record.experiments[k].start, step=record.dt)
+    """Return the axis of time of experiment k, which counts samples too where these are evenly spaced."""
+    e, title = record.experiments[k], "time" if record.dated else time_title(record.time_unit)
+    return Axis(title, unit=record.time_unit, dates=record.dated, start=e.start,
+                step=record.dt if e.stamps is None else None)
+
+
+def places(record: Data, k: int = 0) -> Array:
+    """Return where on the axis of time the samples (N,) of experiment k lie."""
+    e = record.experiments[k]
+    return e.start + record.timelines[k].elapsed(np.arange(e.n_samples))
+
+
+def is_held(u: Array) -> bool:
+    """Return whether an input (N,) keeps its value at most of its samples, as one that is held between its moves."""
+    known = u[np.isfinite(u)]
+    return bool(2 * np.count_nonzero(np.diff(known)) < known.size)
 
 
 def response_axis(model: Any) -> Axis:
@@ -125,10 +138,10 @@ def time_charts(record: Data, k: int, runs: Sequence[Lines], group: str = "", ca
                 part: slice = slice(None), heights: tuple[int, int] = (300, 190)) -> list[Chart]:
     """Return charts of every output, measured and of some runs, and of every input over some samples of experiment k.
 
-    A run that is an interval is drawn as a band.
+    A run that is an interval is drawn as a band, an input that `is_held` as steps.
     """
     e = record.experiments[k]
-    t, x = (e.start + record.dt * np.arange(e.n_samples, dtype=float))[part], time_axis(record, k)
+    t, x = places(record, k)[part], time_axis(record, k)
     several = f", experiment {k + 1} of {record.n_experiments}" if record.n_experiments > 1 else ""
     charts = []
     for o, name in enumerate(record.outputs):
@@ -139,8 +152,9 @@ def time_charts(record: Data, k: int, runs: Sequence[Lines], group: str = "", ca
         y = channel_axis(name, record.output_units[o])
         charts.append(Chart(f"Output {name}{several}", caption, x, y, series, group, height=heights[0]))
     for c, name in enumerate(record.inputs):
-        charts.append(Chart(f"Input {name}{several}", "", x, channel_axis(name, record.input_units[c]),
-                            [Series(name, t, e.u[part, c], colour="muted", width=1.2)], group, height=heights[1]))
+        curve = Series(name, t, e.u[part, c], colour="muted", width=1.2, held=is_held(e.u[:, c]))
+        charts.append(Chart(f"Input {name}{several}", "", x, channel_axis(name, record.input_units[c]), [curve], group,
+                            height=heights[1]))
     return charts
 
 

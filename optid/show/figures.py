@@ -21,8 +21,8 @@ def channels(data: Data) -> Figure:
     axes = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
     x = charts.time_axis(data)
     for c, (panel, (name, unit)) in enumerate(zip(axes, units.items())):
-        for e, samples in zip(data.experiments, data.records):
-            t = panels.instants(e.start + data.dt * np.arange(e.n_samples), x)
+        for k, samples in enumerate(data.records):
+            t = panels.instants(charts.places(data, k), x)
             panel.plot(*panels.thin_line(t, samples[:, c]), lw=0.9, drawstyle="steps-post" if c < data.m else "default")
         panel.set_ylabel(plain(f"{name} [{unit}]" if unit else name))
     axes[-1].set_xlabel(x.title)

@@ -79,7 +79,8 @@ def _series(one: Series, most: int) -> dict[str, Any]:
         kept = extremes(ys, most // 2)
         xs, ys, lows = xs[kept], ys[kept], None if lows is None else lows[kept]
     coded = {"name": one.name, "kind": one.kind, "colour": f"var(--{one.colour})", "dash": one.dash,
-             "width": one.width, "aside": one.aside, "xs": _numbers(xs, "<f8"), "ys": _numbers(ys, "<f4")}
+             "width": one.width, "aside": one.aside, "held": one.held, "xs": _numbers(xs, "<f8"),
+             "ys": _numbers(ys, "<f4")}
     return coded if lows is None else {**coded, "lows": _numbers(lows, "<f4")}
 
 

@@ -176,7 +176,8 @@ def draw_chart(ax: Axes, chart: Chart, legend: bool = True, title: str = "") -> 
                     label=name, fillstyle="none" if one.kind == "zeros" else "full")
         else:
             style: Any = (0, tuple(map(float, one.dash.split()))) if one.dash else dash
-            ax.plot(*thin_line(xs, ys), color=colour, linestyle=style, linewidth=0.85 * one.width, label=name)
+            ax.plot(*thin_line(xs, ys), color=colour, linestyle=style, linewidth=0.85 * one.width, label=name,
+                    drawstyle="steps-post" if one.held else "default")
     ax.set(xlabel=plain(chart.x.title), ylabel=plain(chart.y.title), title=plain(title or chart.title))
     ax.set(**{f"{name}scale": "log" for name, axis in (("x", chart.x), ("y", chart.y)) if axis.log})
     ax.set(xlim=(chart.x.low, chart.x.high), ylim=(chart.y.low, chart.y.high))

@@ -39,8 +39,8 @@ class Banner:
 class Axis:
     """An axis: its title with the unit, whether it is logarithmic, its ends where they are fixed, the bare unit.
 
-    The axis of a record counts samples too: `start` is the place of sample 0, `step` the sampling time. Places are
-    seconds since 1970 where they are `dates`.
+    The axis of a record counts samples too: `start` is the place of sample 0, `step` the sampling time if there is
+    one. Places are seconds since 1970 where they are `dates`.
     """
 
     title: str
@@ -68,6 +68,7 @@ class Series:
     dash: str = ""  # SVG dashes
     width: float = 1.6  # of the line, in pixels
     aside: bool = False  # whether the extent of the chart does not count it
+    held: bool = False  # whether a curve keeps every value until the next
 
 
 @dataclass(frozen=True)

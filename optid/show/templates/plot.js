@@ -79,8 +79,7 @@ function dateTitle(title, low, high, most) {
 // Where a value lies on an axis, in words; of a record with the number of the sample.
 function placeText(axis, value) {
   const sample = axis.step ? Math.round((value - axis.start) / axis.step) : null;
-  if (axis.dates) return `${dateText(value)}, sample ${sample}`;
-  const text = `${axis.title}: ${axis.step ? Number(value.toPrecision(10)) : significant(value, 5)}`;
+  const text = axis.dates ? dateText(value) : `${axis.title}: ${axis.step ? Number(value.toPrecision(10)) : significant(value, 5)}`;
   return sample === null || axis.title.includes("sample") ? text : `${text}, sample ${sample}`;
 }
 
@@ -136,8 +135,8 @@ let plots = 0;
 
 // spec: label, x and y axes {title, log, categories, ticks, format, low, high}, series [{name, colour, dash, kind, xs, ys, halves}],
 // rules [{y, label}], tip(series, i), open(series, i); hidden: set of the names that are switched off. Curves may have lows
-// (bands); `aside` keeps a series out of the extent, `equal` makes both units as long, `cursor` shows every curve at a place,
-// and `moved(low, high)` hears of another extent of x. `below(frame)` returns what a tool draws under the curves,
+// (bands), `held` ones are steps; `aside` keeps a series out of the extent, `equal` makes both units as long, `cursor` shows
+// every curve at a place, and `moved(low, high)` hears of another extent of x. `below(frame)` returns what a tool draws under the curves,
 // `places(axis)` where on an axis it does so, and
 // `grab(event, x, y, frame)` may take a press of the mouse for it, and then returns true.
 function makePlot(host, spec, hidden) {
@@ -276,7 +275,7 @@ function makePlot(host, spec, hidden) {
     let d = "", pen = false;
     for (const i of kept) {
       if (!Number.isFinite(one.ty[i])) { pen = false; continue; }
-      d += `${pen ? "L" : "M"}${x(i)} ${y(one.ty[i])}`;
+      d += pen && one.held ? `H${x(i)}V${y(one.ty[i])}` : `${pen ? "L" : "M"}${x(i)} ${y(one.ty[i])}`;
       pen = true;
     }
     return [element("svg:path", { ...style, "stroke-width": one.width || 1.6, "stroke-linejoin": "round", d })];
