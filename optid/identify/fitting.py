@@ -82,15 +82,22 @@ class Fit(Rendered):
         """Status, proof, residuals and times."""
         solution, evidence = self.outcome.solution, self.outcome.evidence
         if evidence and callable(evidence.bound):
-            asked = self.settings.get("prove", True)
+            asked, started = self.settings.get("prove", True), time.perf_counter()
             bound = evidence.bound() if asked else Bound.none("no proof was asked for")
             closed = bound.proved and solution.status is Status.LOCAL
-            solution = replace(solution, bound=bound, **(
+            late = time.perf_counter() - started if asked else 0.0
+            times = replace(solution.times, prove=solution.times.prove + late, late=late)
+            solution = replace(solution, bound=bound, times=times, **(
                 {"status": Status.OPTIMAL, "reason": bound.reason} if closed else {}))
         reason, unbounded = _stand_in(self.arguments), solution.bound is not None and solution.bound.value == -np.inf
         if not reason or unbounded or solution.status not in (Status.OPTIMAL, Status.LOCAL):
             return solution
         return replace(solution, status=Status.LOCAL, bound=Bound.none(reason), reason=reason)
+
+    @property
+    def total_seconds(self) -> float:
+        """The `seconds` of the fit and those of a proof that is tried when the solution is first asked for."""
+        return self.seconds + self.solution.times.late
 
     @cached_property
     def _completed(self) -> tuple[Any, dict[str, Any]]:

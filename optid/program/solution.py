@@ -74,7 +74,7 @@ class Times:
     """Seconds spent building, solving, judging and proving.
 
     ``compile`` is the part of ``solve`` that translated the programme for the solver; nan where the back end does
-    not measure it.
+    not measure it. ``late`` is the part of ``prove`` after the fit, where the solution was first asked for.
     """
 
     build: float = 0.0
@@ -82,6 +82,7 @@ class Times:
     judge: float = 0.0
     prove: float = 0.0
     compile: float = float("nan")
+    late: float = 0.0
 
     @property
     def total(self) -> float:

@@ -173,7 +173,7 @@ def _optimum(fit: "Fit") -> list[Any]:
     cards = [("relative gap to the bound", "none" if solution.bound is None else wording.gap_text(solution.gap))]
     if fit.prices:
         cards.append(("constraints active", f"{sum(p.binding for p in fit.prices)} of {len(fit.prices)}"))
-    cards.append(("time", phrases.seconds(fit.seconds)))
+    cards.append(("time", phrases.seconds(fit.total_seconds)))
     right = [(name, value) for name, value in summary.certificate_facts(fit)
              if name in ("Objective", "Bound", "Relative gap")]
     right += [(name, value) for name, value in summary.solver_facts(fit) if name in ("Solver", "Iterations", "Total")]

@@ -210,8 +210,9 @@ def solver_facts(fit: "Fit") -> Facts:
         facts.append(("Iterations", str(s.iterations)))
     if len(fit.steps) > 1:
         facts.append(("Programmes solved", str(len(fit.steps))))
-    times = (s.times.build, s.times.solve, s.times.judge, s.times.prove, fit.seconds)
-    return facts + list(zip(("Building", "Solving", "Verifying", "Proving", "Total"), map(seconds, times)))
+    times = [("Building", s.times.build), ("Solving", s.times.solve), ("Verifying", s.times.judge)]
+    times += [("Proving", s.times.prove)] if s.times.prove else []
+    return facts + [(name, seconds(spent)) for name, spent in [*times, ("Total", fit.total_seconds)]]
 
 
 def steps_table(fit: "Fit") -> Table | None:

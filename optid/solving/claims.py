@@ -70,7 +70,8 @@ def verdict(problem: Problem, back_end: BackEnd, answer: Answer, base: Solution,
         return _conflict(base, reason)
     bound: Bound | None = None
     unknown = bool(np.isnan(point.residuals.stationarity))  # only a bound can confirm the point
-    if status in (Status.LOCAL, Status.INACCURATE) and (prove and not problem.step or unknown):
+    asked = status in (Status.LOCAL, Status.INACCURATE) and (prove and not problem.step or unknown)
+    if asked:
         point, bound = _proof(problem, back_end, settings, point, separate)
         assert point.residuals is not None
         outside = point.residuals.violation > tolerance(settings.accuracy)
@@ -82,9 +83,9 @@ def verdict(problem: Problem, back_end: BackEnd, answer: Answer, base: Solution,
             status, reason = Status.INACCURATE, f"the certified bound is not reached: {bound.reason}"
         if status is Status.LOCAL and unknown and not _confirmed(problem, back_end, settings, point, separate):
             status, reason = Status.INACCURATE, f"{back_end.name} claims success, but {REFERENCE} finds a better point"
-    done = time.perf_counter()
+    proving = time.perf_counter() - judged if asked else 0.0
     return replace(point, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
-                   bound=bound, times=replace(base.times, judge=judged - clock, prove=done - judged))
+                   bound=bound, times=replace(base.times, judge=judged - clock, prove=proving))
 
 
 def _conflict(base: Solution, reason: str) -> Solution:

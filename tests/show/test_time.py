@@ -18,7 +18,8 @@ from optid.errors import DataError
 from optid.faults import diagnose, load_diagnosis
 from optid.identify.responses import responses
 from optid.models import HammersteinTF
-from optid.show import charts, printing
+from optid.models.process import process_model
+from optid.show import charts, printing, summary
 from optid.show.notebook import fit_html, search_html
 from optid.show.page import encode_chart
 from optid.show.responses import curve_charts
@@ -242,6 +243,33 @@ def test_a_page_carries_dates_to_the_microsecond(n):
 
 def test_the_start_of_an_undated_record_is_told_to_the_page():
     assert encode_chart(charts.time_charts(record(dt=0.1), 0, [])[0])["x"]["start"] == 0.0
+
+
+@pytest.mark.parametrize("start", [0.0, DATE])
+def test_samples_at_irregular_times_are_drawn_there_and_held_inputs_as_steps(start):
+    after = np.cumsum(np.random.default_rng(1).uniform(1, 9, 40))
+    times = start + after if start == 0.0 else np.datetime64(start, "us") + (1e6 * after).astype("m8[us]")
+    moving = np.random.default_rng(2).standard_normal(40)
+    data = optid.Data(np.column_stack([np.repeat([0.0, 1.0, np.nan, 2.0], 10), moving]), moving, times=times)
+    shown = charts.time_charts(data, 0, [])
+    begin = data.experiments[0].start
+    for chart in shown:
+        np.testing.assert_allclose(chart.series[0].xs - begin, after - after[0], atol=1e-6)
+        assert encode_chart(chart)["x"].keys().isdisjoint({"step"})
+    assert [encode_chart(chart)["series"][0]["held"] for chart in shown] == [False, True, False]
+    drawn = data.plot().axes[0].lines[0]
+    assert drawn.get_drawstyle() == "steps-post" and np.array_equal(drawn.get_xdata(), data.time)
+
+
+def test_the_time_of_a_proof_is_shown_once_there_is_one():
+    u = np.repeat([0.0, 1.0, 0.3], 40)
+    y = process_model("P1", K=2.0, tau=9.0, dt=1.0).respond(u[:, None]).ravel()
+    data = optid.Data(u, y + 0.01 * np.random.default_rng(0).standard_normal(120), dt=1.0)
+    fits = optid.fit(data, "process.exact", process="P1"), optid.fit(data, "process.exact", process="P1", prove=False)
+    for fit, proved in zip(fits, (True, False)):
+        facts, times = dict(summary.solver_facts(fit)), fit.solution.times
+        assert ("Proving" in facts) == proved == (times.prove > 0)
+        assert fit.total_seconds == fit.seconds + times.late and times.late == times.prove
 
 
 # -- faults

@@ -209,7 +209,7 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
         "gap": solution.gap, "iterations": sum(counts) if min(counts, default=-1) >= 0 else None,
         "build_s": solution.times.build, "compile_s": sum(compiled) if compiled else None,
         "solve_s": sum(t.solve for t in times) - sum(compiled), "judge_s": sum(t.judge for t in times),
-        "prove_s": sum(t.prove for t in times), "fit_s": fitted.seconds,
+        "prove_s": sum(t.prove for t in times) + solution.times.late, "fit_s": fitted.total_seconds,
     }
     if residuals is not None:
         row |= {name: getattr(residuals, name) for name in ("violation", "stationarity", "complementarity")}
