@@ -20,6 +20,7 @@ from optid.kernel_cache import cached_njit
 
 GONE = 300.0  # time constants after which a decay is zero: products of numbers near the smallest ones are slow
 SERIES = 1e-3  # difference of the poles times the time, below which a series has more digits
+P_MOST, Q_MOST, SLOPE_MOST = 0.3091, 0.3679, 0.1354  # of |p|, q, and |q'| after its zero: at z = 2.62, 1 and 2
 
 
 @cached_njit
@@ -72,23 +73,99 @@ def one_pole_courses(boxes, smooth, t, s, w):
 
 
 @cached_njit
-def step_of_two(t, a, b, found):
-    """Write S, its derivatives by log a and log b, and minus that by t, at a time after the onset."""
+def step_of_two(t, a, b):
+    """Return S, its derivatives by log a and log b, and minus that by t, at a time after the onset."""
     if t <= 0.0:
-        found[:] = 0.0
-        return
+        return 0.0, 0.0, 0.0, 0.0
     first, second, c = np.exp(-t / a), np.exp(-t / b), 1 / a - 1 / b
     if abs(c * t) < SERIES:
         x = c * t
         both = second * t * (1 - x / 2 + x * x / 6 - x * x * x / 24) / (a * b)
-        found[1] = -second * t * t * (0.5 - x / 3 + x * x / 8 - x * x * x / 30) / (a * b)
-        found[2] = -first * t * t * (0.5 + x / 3 + x * x / 8 + x * x * x / 30) / (a * b)
+        by_a = -second * t * t * (0.5 - x / 3 + x * x / 8 - x * x * x / 30) / (a * b)
+        by_b = -first * t * t * (0.5 + x / 3 + x * x / 8 + x * x * x / 30) / (a * b)
     else:
         both = (second - first) / (c * a * b)
-        found[1] = -(second - (1 + c * t) * first) / (c * c * a * b)
-        found[2] = -(first - (1 - c * t) * second) / (c * c * a * b)
-    found[0] = 1 - first - b * both
-    found[3] = -both
+        by_a = -(second - (1 + c * t) * first) / (c * c * a * b)
+        by_b = -(first - (1 - c * t) * second) / (c * c * a * b)
+    return 1 - first - b * both, by_a, by_b, -both
+
+
+@cached_njit
+def _not_rising(z):
+    """Return the least functions above |p|, q, |q'| and exp(-z) that do not rise, at z."""
+    decay = np.exp(-z)
+    p = P_MOST if z < 2.62 else z * (z - 1) * decay
+    q = Q_MOST if z < 1 else z * decay
+    slope = max((1 - z) * decay, SLOPE_MOST) if z < 2 else (z - 1) * decay
+    return p, q, slope, decay
+
+
+@cached_njit
+def _average(mean, value, kept):
+    """Return the average of a function over an exponential after a step in time, of which it keeps a share."""
+    return kept * mean + (1 - kept) * value
+
+
+@cached_njit
+def _add_course(found, rough, t, move, middle, slow, fast):
+    """Add the response to one move of the input, and how far it is from those of the corners of a box.
+
+    Args:
+        found: (4, N) response and derivatives, added to.
+        rough: (N,) distances, added to.
+        t: (N,) instants.
+        move: its time and size.
+        middle: time constants and dead time in the middle of the box.
+        slow: the largest of the box.
+        fast: the smallest.
+    """
+    for k in range(len(t)):
+        since = t[k] - move[0]
+        if since > fast[2]:
+            here = step_of_two(since - middle[2], middle[0], middle[1])
+            low = step_of_two(since - slow[2], slow[0], slow[1])[0]
+            high = step_of_two(since - fast[2], fast[0], fast[1])[0]
+            for o in range(4):
+                found[o, k] += move[1] * here[o]
+            rough[k] += abs(move[1]) * max(high - here[0], here[0] - low)
+
+
+@cached_njit
+def _add_rest(rest, t, move, slow, fast, half):
+    """Add how far the response to one move can be off its tangent: second derivatives times halves of a box.
+
+    Functions and averages are those of the docstring of the module in units of 1 / tau: ``q1_k2`` is q1 * k2. From one
+    sample to the next no function exceeds its bound at the first.
+
+    Args:
+        rest: (N,) distances, added to.
+        t: (N,) instants.
+        move: its time and size.
+        slow: the largest time constants and dead time of the box.
+        fast: the smallest.
+        half: half the edges of the box.
+    """
+    tau1, tau2, early = fast
+    h1, h2, h3 = half
+    p1, q1, slope1, decay1, p2, q2 = P_MOST, Q_MOST, 1.0, 1.0, P_MOST, Q_MOST
+    p1_k2, q1_k2, q1_k2_k2, slope1_k2, decay1_k2, p2_k1, q2_k1 = P_MOST, Q_MOST, Q_MOST, 1.0, 1.0, P_MOST, Q_MOST
+    before = np.inf
+    for k in range(len(t)):
+        since = t[k] - move[0]
+        if since <= early:
+            continue
+        if since > before:
+            kept1, kept2 = np.exp((before - since) / slow[0]), np.exp((before - since) / slow[1])
+            q1_k2_k2 = _average(q1_k2_k2, q1_k2, kept2)
+            q1_k2, q2_k1 = _average(q1_k2, q1, kept2), _average(q2_k1, q2, kept1)
+            p1_k2, p2_k1 = _average(p1_k2, p1, kept2), _average(p2_k1, p2, kept1)
+            slope1_k2, decay1_k2 = _average(slope1_k2, slope1, kept2), _average(decay1_k2, decay1, kept2)
+        before, late = since, max(since - slow[2], 0.0)
+        p1, q1, slope1, decay1 = _not_rising(late / slow[0])
+        p2, q2, _, decay2 = _not_rising(late / slow[1])
+        rest[k] += abs(move[1]) * (
+            p1_k2 * h1 * h1 / 2 + p2_k1 * h2 * h2 / 2 + max(q1_k2, q1_k2_k2) * h1 * h2 + slope1_k2 / tau1 * h1 * h3
+            + max(q2, q2_k1) / tau1 * h2 * h3 + max(decay2 / tau2, decay1_k2 / tau1) / tau1 * h3 * h3 / 2)
 
 
 @cached_njit
@@ -96,43 +173,12 @@ def two_pole_courses(boxes, t, s, w):
     """Return the same as `one_pole_courses` for two poles and boxes (B, 6) of log tau1, log tau2 and theta."""
     count, n = len(boxes), len(t)
     x, rough, fine = np.zeros((count, 4, n)), np.zeros((count, n)), np.zeros((count, n))
-    middle, low, high = np.zeros(4), np.zeros(4), np.zeros(4)
     for i in range(count):
-        a1, b1, a2, b2 = np.exp(boxes[i, 0]), np.exp(boxes[i, 1]), np.exp(boxes[i, 2]), np.exp(boxes[i, 3])
-        m1, m2 = np.exp((boxes[i, 0] + boxes[i, 1]) / 2), np.exp((boxes[i, 2] + boxes[i, 3]) / 2)
-        early, late = boxes[i, 4], boxes[i, 5]
-        theta = (early + late) / 2
-        h1, h2, h3 = (boxes[i, 1] - boxes[i, 0]) / 2, (boxes[i, 3] - boxes[i, 2]) / 2, (late - early) / 2
+        a1, b1, a2, b2, early, late = boxes[i]
+        fast, slow = (np.exp(a1), np.exp(a2), early), (np.exp(b1), np.exp(b2), late)
+        middle = np.exp((a1 + b1) / 2), np.exp((a2 + b2) / 2), (early + late) / 2
+        half = (b1 - a1) / 2, (b2 - a2) / 2, (late - early) / 2
         for j in range(len(s)):
-            size, before = abs(w[j]), -1.0
-            # averages p1 * k2, p2 * k1, q1 * k2, q1 * k2 * k2, q2 * k1, |q1'| * k2 and k1 * k2
-            p12, p21, q12, q122, q21, r12, k12 = 0.3091, 0.3091, 0.3679, 0.3679, 0.3679, 1 / a1, 1 / a1
-            p1, p2, q1, q2, r1, k1 = 0.3091, 0.3091, 0.3679, 0.3679, 1 / a1, 1 / a1
-            for k in range(n):
-                since = t[k] - s[j]
-                if since <= early:
-                    continue
-                step_of_two(since - theta, m1, m2, middle)
-                step_of_two(since - late, b1, b2, low)
-                step_of_two(since - early, a1, a2, high)
-                for o in range(4):
-                    x[i, o, k] += w[j] * middle[o]
-                rough[i, k] += size * max(high[0] - middle[0], middle[0] - low[0])
-                if before >= 0.0:  # over the time since the sample before, functions are at most what they were
-                    g1, g2 = np.exp((before - since) / b1), np.exp((before - since) / b2)
-                    q122 = g2 * q122 + (1 - g2) * q12
-                    p12, p21 = g2 * p12 + (1 - g2) * p1, g1 * p21 + (1 - g1) * p2
-                    q12, q21 = g2 * q12 + (1 - g2) * q1, g1 * q21 + (1 - g1) * q2
-                    r12, k12 = g2 * r12 + (1 - g2) * r1, g2 * k12 + (1 - g2) * k1
-                before = since
-                z1, z2 = max(since - late, 0.0) / b1, max(since - late, 0.0) / b2
-                e1, e2 = np.exp(-z1), np.exp(-z2)
-                p1 = 0.3091 if z1 < 2.62 else z1 * (z1 - 1) * e1
-                p2 = 0.3091 if z2 < 2.62 else z2 * (z2 - 1) * e2
-                q1, q2 = 0.3679 if z1 < 1 else z1 * e1, 0.3679 if z2 < 1 else z2 * e2
-                r1 = (max((1 - z1) * e1, 0.1354) if z1 < 2 else (z1 - 1) * e1) / a1
-                k1 = e1 / a1
-                fine[i, k] += size * (
-                    p12 * h1 * h1 / 2 + p21 * h2 * h2 / 2 + max(q12, q122) * h1 * h2 + r12 * h1 * h3
-                    + max(q2, q21) / a1 * h2 * h3 + max(e2 / a2, k12) / a1 * h3 * h3 / 2)
+            _add_course(x[i], rough[i], t, (s[j], w[j]), middle, slow, fast)
+            _add_rest(fine[i], t, (s[j], w[j]), slow, fast, half)
     return x, rough, fine
