@@ -35,11 +35,11 @@ class Timeline:
     def instants(self, samples: Any) -> np.ndarray:
         """Return the times of samples (n,), as datetime64 where they are dates."""
         if not self.dated:
-            return self.start + self.elapsed(samples)
+            return self.start + self.times_after_start(samples)
         start = np.datetime64(round(self.start * 1e6), "us").astype("M8[ns]")  # seconds since 1970 hold microseconds
-        return start + np.round(self.elapsed(samples) * 1e9).astype("m8[ns]")
+        return start + np.round(self.times_after_start(samples) * 1e9).astype("m8[ns]")
 
-    def elapsed(self, samples: Any) -> np.ndarray:
+    def times_after_start(self, samples: Any) -> np.ndarray:
         """Return the times of samples (n,) after sample 0."""
         return self.dt * np.asarray(samples, dtype=float) if self.stamps is None else self.stamps[np.asarray(samples)]
 

@@ -51,7 +51,7 @@ def time_axis(record: Data, k: int = 0) -> Axis:
 def places(record: Data, k: int = 0) -> Array:
     """Return where on the axis of time the samples (N,) of experiment k lie."""
     e = record.experiments[k]
-    return e.start + record.timelines[k].elapsed(np.arange(e.n_samples))
+    return e.start + record.timelines[k].times_after_start(np.arange(e.n_samples))
 
 
 def is_held(u: Array) -> bool:
