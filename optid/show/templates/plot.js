@@ -136,9 +136,9 @@ let plots = 0;
 // spec: label, x and y axes {title, log, categories, ticks, format, low, high}, series [{name, colour, dash, kind, xs, ys, halves}],
 // rules [{y, label}], tip(series, i), open(series, i); hidden: set of the names that are switched off. Curves may have lows
 // (bands), `held` ones are steps; `aside` keeps a series out of the extent, `equal` makes both units as long, `cursor` shows
-// every curve at a place, and `moved(low, high)` hears of another extent of x. `below(frame)` returns what a tool draws under the curves,
-// `places(axis)` where on an axis it does so, and
-// `grab(event, x, y, frame)` may take a press of the mouse for it, and then returns true.
+// every curve at a place, and `moved(low, high)` hears of another extent of x. `below(frame)` returns what a tool draws
+// under the curves, `places(axis)` where on an axis it does so, and `grab(event, x, y, frame)` may take a press of the mouse
+// for it, and then returns true.
 function makePlot(host, spec, hidden) {
   const id = "plot" + ++plots, box = element("div", { class: "plot" });
   const svg = element("svg:svg", { class: "chart", role: "img", tabindex: "0", "aria-label": spec.label, "aria-describedby": id + "-keys" });
