@@ -222,6 +222,9 @@ def main() -> None:
     elif not options.data:
         parser.error("name the folder of the records with --data or OPTID_DATA")
     else:
+        known = [name for name, _ in records(Path(options.data))]
+        if unknown := set(options.only or ()) - set(known):
+            parser.error(f"--only knows no {', '.join(sorted(unknown))}: use {', '.join(known)}")
         on_records(Path(options.data), options.effort, options.only, options.oracle)
 
 
