@@ -229,7 +229,7 @@ class Decisions:
         if self.phase == NAMING or self.groups[chosen] != self.groups[self.named]:
             self.phase, self.named, self.named_at = SETTLING, chosen, now
             event = self._event("isolated", now, chosen, gains, window)
-            self.told = [label for label, _ in event.candidates]
+            self.told = event.labels
             return event
         return self._carry(now, chosen, window, plant)
 
@@ -343,10 +343,9 @@ class Decisions:
         rival = other.statistic - float(self.thresholds.max())
         if found and (other.candidates[0][0] == UNKNOWN or found[0].gain > rival):
             other = Event.of_answers(other.kind, other.sample, found)
-        labels = [label for label, _ in other.candidates]
-        if labels == self.told:
+        if other.tells(self.told):
             return None
-        self.told = labels
+        self.told = other.labels
         return other
 
     def _left_over(self, number: int, window: Window) -> tuple[float, float]:
