@@ -26,10 +26,10 @@ from formulations.faults.refit import actuator, parameters
 from optid import Data
 from optid.bases import Triangular, UserFunctions
 from optid.errors import OptidError
-from optid.faults import trajectory
+from optid.faults import Surroundings, trajectory
 from optid.faults.repair.damage import Damage
 from optid.faults.repair.refitting import RefitPrior, Refitting, refitting
-from optid.faults.repair.schedule import refit
+from optid.faults.repair.schedule import RefitRules, refit
 from optid.models import HammersteinSS, Nonlinearity
 from optid.solving.solve import run
 
@@ -62,7 +62,8 @@ def record(plant: HammersteinSS, damaged: HammersteinSS, count: int, seed: int) 
     u = levels(BEFORE + count, 1000 + seed)
     before = trajectory(plant, u[: BEFORE + 1], seed=seed)
     last = [model.expand_inputs(u[BEFORE - 1 : BEFORE])[0] for model in (plant, damaged)]
-    after = trajectory(damaged, u[BEFORE:], seed=50_000 + seed, x0=before.x[-1] + plant.B @ (last[1] - last[0]))
+    x0 = before.x[-1] + plant.B @ (last[1] - last[0])
+    after = trajectory(damaged, u[BEFORE:], seed=50_000 + seed, surroundings=Surroundings(x0))
     return Data(u, np.vstack([before.y[:BEFORE], after.y]))
 
 
@@ -136,7 +137,7 @@ def one(plant: HammersteinSS, damaged: HammersteinSS, count: int, seed: int, off
         "all, prior": wide,
         "all, no prior": no_prior,
         "wrong actuator": lambda: narrow(0),
-        "schedule": lambda: refit(known, data, broken(1))[0],
+        "schedule": lambda: refit(known, data, broken(1), RefitRules())[0],
     }
     results = {}
     for word, how in tries.items():

@@ -14,10 +14,11 @@ import numpy as np
 from plants import levels, standard_plant
 
 from optid import Data
-from optid.faults import conditional_mean, observer, subspace_projection, trajectory
+from optid.faults import Surroundings, conditional_mean, observer, subspace_projection, trajectory
 from optid.identify.tracking import SubspaceTracker
 
 SAMPLES, SETTLED, LENGTHS, LAGS = 1500, 50, (300, 1000, 4000), 8
+AT_REST = Surroundings("rest")
 
 
 def tracked(model, healthy: Data, seen: Data, lost: int) -> np.ndarray:
@@ -54,7 +55,7 @@ def main() -> None:
         spread = []
         for run in range(options.runs):
             u = levels(SAMPLES, 500 + run)
-            told = trajectory(plant, u, seed=run, x0="rest")
+            told = trajectory(plant, u, seed=run, surroundings=AT_REST)
             clean = (told.x @ plant.C.T + plant.expand_inputs(u) @ plant.D.T)[:, lost]
             record = Data(u, told.y)
             spread.append(np.var(clean[SETTLED:]))
@@ -62,7 +63,7 @@ def main() -> None:
                 u, x0=told.x[0])[:, lost]}
             for length in LENGTHS:
                 w = levels(length, 900 + run)
-                healthy = Data(w, trajectory(plant, w, seed=3000 + run, x0="rest").y)
+                healthy = Data(w, trajectory(plant, w, seed=3000 + run, surroundings=AT_REST).y)
                 for word, learn in (("conditional mean", conditional_mean), ("subspace", subspace_projection)):
                     estimates[f"{word} {length}"] = learn(plant, healthy, [name]).estimate(record)[:, 0]
                 estimates[f"PAST {length}"] = tracked(plant, healthy, record, lost)

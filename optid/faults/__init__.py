@@ -4,7 +4,7 @@ from optid.lazy import on_first_use
 
 _HOME = {
     "faults": ["Fault"],
-    "injection": ["inject", "trajectory"],
+    "injection": ["inject", "trajectory", "Surroundings"],
     "rank.hard_over": ["hard_over_test", "HardOver"],
     "whitening": ["whiten", "health", "predictor"],
     "nuisance": ["model_uncertainty"],

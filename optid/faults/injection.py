@@ -29,6 +29,15 @@ class Trajectory(NamedTuple):
     x: Array
 
 
+class Surroundings(NamedTuple):
+    """What a plant is simulated with beside its faults; the attributes are arguments of `inject`."""
+
+    x0: Any = "zero"
+    noise: NoiseCovariances | str = "model"
+    process: Mapping[str, ArrayLike] | None = None
+    feedback: str = "measured"
+
+
 def inject(
     model: "HammersteinSS", u: Any, faults: Fault | Sequence[Fault] = (), *, seed: int | None = 0, x0: Any = "zero",
     noise: NoiseCovariances | str = "model", process: Mapping[str, ArrayLike] | None = None, feedback: str = "measured",
@@ -57,22 +66,24 @@ def inject(
         LookupFailed: a channel or direction that the model does not have.
         StructureError: sizes that do not fit, no noise covariances, functions of the user in the feedback.
     """
-    how: dict[str, Any] = {"x0": x0, "noise": noise, "process": process, "feedback": feedback}
+    surroundings = Surroundings(x0, noise, process, feedback)
     records, _ = records_of(model, u)
     seeds = np.random.SeedSequence(seed).spawn(len(records)) if len(records) > 1 else [seed]
     return one_or_all([
-        trajectory(model, inputs, faults, seed=own, **how).y for (inputs, _, _), own in zip(records, seeds)
+        trajectory(model, inputs, faults, seed=own, surroundings=surroundings).y
+        for (inputs, _, _), own in zip(records, seeds)
     ])
 
 
 def trajectory(
-    model: "HammersteinSS", u: ArrayLike, faults: Fault | Sequence[Fault] = (), *, seed: Any = 0, x0: Any = "zero",
-    noise: NoiseCovariances | str = "model", process: Mapping[str, ArrayLike] | None = None, feedback: str = "measured",
+    model: "HammersteinSS", u: ArrayLike, faults: Fault | Sequence[Fault] = (), *, seed: Any = 0,
+    surroundings: Surroundings | None = None,
 ) -> Trajectory:
     """Simulate one record as `inject` does and return the states, too."""
     from optid.faults.kernels import march_faulty
     from optid.models.state_kernels import INSIDE, REFUSED
 
+    x0, noise, process, feedback = surroundings or Surroundings()
     if feedback not in ("measured", "true"):
         raise StructureError(f"feedback={feedback!r}: use 'measured' or 'true'.")
     if not model.parts.tables.compiled:

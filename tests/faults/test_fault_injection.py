@@ -8,7 +8,7 @@ from fault_plants import levels, noisy, standard
 from state_systems import USER, with_feedback
 
 from optid.errors import DataError, LookupFailed, StructureError
-from optid.faults import Fault, inject, trajectory
+from optid.faults import Fault, Surroundings, inject, trajectory
 
 N = 60
 
@@ -40,7 +40,7 @@ def by_hand(model, u, x0, state=None, output=None, to_x=None, to_y=None, gain=No
 
 
 def close(model, u, faults, x0=(0.1, -0.2, 0.3), **reference):
-    found = trajectory(model, u, faults, x0=x0, noise="none")
+    found = trajectory(model, u, faults, surroundings=Surroundings(x0, "none"))
     x, y = by_hand(model, u, x0, **reference)
     np.testing.assert_allclose(found.x, x, atol=1e-12)
     np.testing.assert_allclose(found.y, y, atol=1e-12)
@@ -61,7 +61,7 @@ def test_offsets_change_the_state_at_the_onset_and_not_before(kind, onset):
     course = {"step": since >= 0, "jump": since == 0, "ramp": np.maximum(since + 1, 0)}[kind].astype(float)
     found = close(model, u, make("process:load", onset, 0.7, direction=direction),
                   to_x=np.outer(course, 0.7 * direction))
-    healthy = trajectory(model, u, x0=(0.1, -0.2, 0.3), noise="none")
+    healthy = trajectory(model, u, surroundings=Surroundings((0.1, -0.2, 0.3), "none"))
     np.testing.assert_array_equal(found.x[:onset], healthy.x[:onset])
     np.testing.assert_allclose(found.x[onset] - healthy.x[onset], 0.7 * direction)
     close(model, u, make("state", onset, direction), to_x=np.outer(course, direction))
@@ -121,7 +121,7 @@ def test_scheduled_matrices_as_arrays_and_as_functions():
     close(model, u, [Fault.schedule(A=A, B=B), Fault.ramp("actuator:u2", 0, 0.2)], A=A, B=B, to_x=to_x, to_y=to_y)
     late = np.where(np.arange(N)[:, None, None] >= 29, A, model.A)
     found = close(model, u, Fault.schedule(30, A=lambda k: A[k]), A=late)
-    healthy = trajectory(model, u, x0=(0.1, -0.2, 0.3), noise="none")
+    healthy = trajectory(model, u, surroundings=Surroundings((0.1, -0.2, 0.3), "none"))
     np.testing.assert_array_equal(found.x[:30], healthy.x[:30])
     assert not np.allclose(found.x[30], healthy.x[30])
 

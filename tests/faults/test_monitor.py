@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from optid.bases import Linear, Polynomial, UserFunctions
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, ModelFileError, StructureError
-from optid.faults import Fault, Monitor, dictionary, inject, whiten
+from optid.faults import Fault, Monitor, diagnose, dictionary, inject, whiten
 from optid.models import Nonlinearity
 
 HIGH = 1e9
@@ -434,6 +434,15 @@ def test_two_faults_at_once_are_told_together():
     assert last.candidates[0][0] == "sensor:y1 + sensor:y2" and last.note == "more than one fault"
     assert abs(last.onset - 150) <= 1 and np.allclose(last.size, 2.0, atol=0.3)
     assert all(e.sample <= 165 for e in events if "more than" not in e.note) and monitor.alarmed
+
+
+def test_two_faults_are_not_taken_for_a_disturbance_of_unknown_direction():
+    """One with as many magnitudes as the plant has states fits them within the noise, but less well than they do."""
+    model, u = plant(), levels(320, 6)[:190]
+    broken = [Fault.step("sensor:y1", 150, 2.0), Fault.step("actuator:u1", 150, 0.8)]
+    found = diagnose(model, (u, inject(model, u, broken, seed=0)), listed(model, "bias", "loss"))
+    assert {fault.name for fault in found.candidates[0].faults} == {"sensor:y1", "actuator:u1"}
+    assert [fault.onset for fault in found.candidates[0].faults] == [150, 150]
 
 
 def test_a_loss_without_excitation_gets_no_verdict_alone():

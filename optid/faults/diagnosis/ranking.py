@@ -8,7 +8,13 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import SolverFailed, StructureError
-from optid.faults.diagnosis.alternatives import UNLISTED, declares_process, same_at_process, split_by_kind
+from optid.faults.diagnosis.alternatives import (
+    UNKNOWN_DIRECTION,
+    UNLISTED,
+    declares_process,
+    same_at_process,
+    split_by_kind,
+)
 from optid.faults.diagnosis.answers import Certificate, Remaining
 from optid.faults.diagnosis.counting import with_model_uncertainty
 from optid.faults.diagnosis.leftover import UNFIT, further_fault, remainder_test
@@ -63,6 +69,11 @@ class RankedExplanation(NamedTuple):
     fitted: Array
     remaining: Remaining
 
+    @property
+    def is_unlisted(self) -> bool:
+        """Whether it is a disturbance of the process of unknown direction."""
+        return any(c.name == UNKNOWN_DIRECTION for c in self.explanation.candidates)
+
 
 class Ranking(NamedTuple):
     """The set of explanations.
@@ -83,6 +94,15 @@ class Ranking(NamedTuple):
     def explains(self) -> bool:
         """Whether one of the residuals agrees with the noise of a healthy plant."""
         return any(fit.remaining.p_value > UNFIT for fit in self.fits)
+
+    @property
+    def settles(self) -> bool:
+        """Whether that is the residual of faults that are listed.
+
+        The disturbance of unknown direction has as many magnitudes as the plant has states, and fits what is left of
+        most pairs of faults.
+        """
+        return any(fit.remaining.p_value > UNFIT and not fit.is_unlisted for fit in self.fits)
 
 
 def explain_record(seen: RecordSearch) -> tuple[RecordSearch, Ranking, bool]:
@@ -108,14 +128,14 @@ def _explained(seen: RecordSearch) -> tuple[RecordSearch, Ranking]:
     """Explain a record by the candidates, with outliers beside them, by two faults."""
     most = seen.asked.max_faults
     ranking = _exact(seen, most)
-    if ranking.explains or seen.search is None or not seen.dictionary.unknown:
+    if ranking.settles or seen.search is None or not seen.dictionary.unknown:
         return seen, ranking
     wide = seen.widened()
     for count in dict.fromkeys((most, 2)):
         wider = _exact(wide, count)
-        if wider.explains:
-            several_searched = "No single fault explains the record: two were searched. " * (count > most)
-            return wide, wider._replace(note=f"{several_searched}{wider.note}".strip())
+        if wider.settles or (count > 1 and wider.explains):
+            searched = "No single fault of the dictionary explains the record: two were searched. " * (count > most)
+            return wide, wider._replace(note=f"{searched}{wider.note}".strip())
     return seen, ranking
 
 

@@ -85,6 +85,7 @@ class RecordSearch:
         lost: {label: why} of candidates that are not testable.
         healthy: residual of the healthy plant.
         outliers: (sample, output) of the removed readings.
+        narrower: the search of the same readings with fewer candidates; None without one.
     """
 
     record: Data
@@ -100,6 +101,7 @@ class RecordSearch:
     lost: dict[str, str]
     healthy: "Remaining"
     outliers: tuple[tuple[int, int], ...]
+    narrower: "RecordSearch | None" = None
 
     @property
     def tested(self) -> list[Candidate]:
@@ -135,17 +137,22 @@ class RecordSearch:
     @cached_property
     def courses(self) -> list[Explanation]:
         """Explanations by frozen sensors and increased noise."""
+        if self.narrower is not None:
+            return self.narrower.courses
         return courses(self.dictionary, self.whitened, self.part)
 
     @cached_property
     def gains_of_sensors(self) -> list[Explanation]:
         """Explanations by sensors that lost a share of their reading."""
+        if self.narrower is not None:
+            return self.narrower.gains_of_sensors
         return sensor_gains(self.dictionary, self.whitened, self.part, self.noise.get("uncertainty"))
 
     def widened(self) -> "RecordSearch":
         """Return the search with the outliers of all sensors among the candidates."""
         asked = replace(self.asked, thresholds=None)
-        return search_record(self.record, self.given, with_spikes(self.dictionary), asked, self.noise)
+        wide = search_record(self.record, self.given, with_spikes(self.dictionary), asked, self.noise)
+        return wide if asked.robust else replace(wide, narrower=self)  # where outliers are removed, others may be
 
 
 def search_record(

@@ -13,36 +13,12 @@ from optid.faults.monitor.actuator_kinds import groups_of, is_grouped, kinds, li
 from optid.faults.monitor.arl import COMMON
 from optid.faults.monitor.columns import Columns, Window
 from optid.faults.monitor.events import Event
+from optid.faults.monitor.noisy_sensor import excess, noisy_sensor
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT
 from optid.faults.monitor.sizes import Recent
 from optid.faults.nuisance import CONFIDENCE
 from optid.faults.signatures import Candidate
-
-RULES = {
-    "certainty": 0.98, "release": 0.5, "patience": 40.0, "settle": 10.0, "still": 10.0, "faded": 1e-8, "learned": 0.02,
-    "forgiven": 0.3, "odd": 4.3, "wrong": 0.02, "beyond": 2.0, "adapt": 1.0,
-}
-"""Numbers of the decisions.
-
-A fault is isolated once its posterior reaches `certainty`, or after `patience` samples. An alarm ends after `still`
-samples with all statistics below `release` of their thresholds. An isolated fault is carried `settle` samples later.
-A transient ends when its energy falls to `faded`. The size of a carried fault is no longer estimated once its standard
-error, propagated over a window, has an energy below `learned`; the fault is cleared when its significance falls below
-the share `forgiven` of the threshold. No candidate explains an alarm when the residual energy is `odd` standard
-deviations too large; the signature of an uncertain model leaves a share `wrong` of the energy that it explains.
-
-Where more windows than a tenth reach the energies that a tenth of the simulated ones reach, the noise has another
-colour than that of the calibration: the thresholds are then multiplied by the ratio of these energies, by `adapt` at
-most.
-
-While an input was outside its identified range in the last window, the thresholds of an uncertain model are multiplied
-by the fourth power of its distance from the middle of the range, relative to half the range, and by `beyond` at most:
-what a model of a smooth plant lacks grows with the square of the distance, and its energy with the fourth power.
-"""
-
-FEWEST = 4
-"""Fewest samples of increased noise."""
 
 WINDOWS, CHANGED = 40, 0.2
 """Windows from which the colour of the noise is taken, and the least change, of the logarithm, of the thresholds."""
@@ -225,7 +201,7 @@ class Decisions:
         return Event("cleared", now)
 
     def _name(self, now: int, best: int, gains: Array, window: Window, plant: RunningFilter) -> Event | None:
-        rule, noise = self.rules, self._noisy_sensor(now, window)
+        rule, noise = self.rules, noisy_sensor(now, window, self.outputs)
         louder = (0.0 if noise is None else noise.statistic) - float(self.thresholds.max())  # an answer, too
         rivals = [gains[self.group(c)].max() for c in sorted(set(self.groups))]
         share = np.exp(np.clip(np.append(rivals, louder) - gains[best], -700, 700) / 2)
@@ -253,7 +229,7 @@ class Decisions:
         if self.phase == NAMING or self.groups[chosen] != self.groups[self.named]:
             self.phase, self.named, self.named_at = SETTLING, chosen, now
             event = self._event("isolated", now, chosen, gains, window)
-            self.told = [label for label, _ in event.candidates]
+            self.told = event.labels
             return event
         return self._carry(now, chosen, window, plant)
 
@@ -280,7 +256,7 @@ class Decisions:
         plant.room(2 * int(self.columns.size.max()))
         left = plant.carry(chosen, window)
         if np.isfinite(left):
-            self.passing.append([chosen, now + _fading(plant, left, self.rules["faded"])])
+            self.passing.append([chosen, now + plant.fades_after(left, self.rules["faded"])])
         self.forgive(window)
         return event
 
@@ -340,25 +316,24 @@ class Decisions:
         age = now - self.alarm
         if self.recent is None or not _is_due(age, SEVERAL_AT) or age >= self.recent.last(0):
             return None
-        noise, found = self._noisy_sensor(now, window), self.recent.answers(self.listed, now + 1)
+        noise, found = noisy_sensor(now, window, self.outputs), self.recent.answers(self.listed, now + 1)
         if noise is None or noise.statistic <= self.thresholds.max():
             noise = Event("revised", now, ((UNKNOWN, 1.0),), note="no candidate explains it")
         return None if found is None else self._by_several(replace(noise, kind="revised"), found)
 
     def _beside(self, event: Event, recent: Recent, window: Window, plant: RunningFilter) -> Event | None:
-        """Return the event of a fault named soon after others, unless a diagnosis contradicts all of them together."""
+        """Return the event of a fault named soon after others, unless other faults explain the last samples."""
         young = [number for number, onset in self.onsets if event.sample - onset < recent.last(0)]
         found = recent.answers(self.listed, event.sample + 1) if young else None
         names = {c.name for c in self.listed if c.label in dict(event.candidates)}
         names |= {self.columns.candidates[number].name for number in young}
-        if found is None or any({fault.name for fault in one.faults} <= names for one in found):
+        if not found or any({fault.name for fault in one.faults} <= names for one in found):
             return event
         for number in young:
             self._release(number, window, plant)
         self.phase, self.named, self.quiet, self.told = LOST, NOTHING, 0, []
         window.restart()
-        note = "no candidate explains it, nor those that were named before"
-        return self._by_several(replace(event, candidates=((UNKNOWN, 1.0),), size=(), note=note), found)
+        return self._by_several(replace(event, candidates=((UNKNOWN, 1.0),)), found)
 
     def _by_several(self, other: Event, found: tuple[FaultAnswer, ...] | None) -> Event | None:
         """Return the answers of a diagnosis, several faults among them, where they explain more than another event.
@@ -368,10 +343,9 @@ class Decisions:
         rival = other.statistic - float(self.thresholds.max())
         if found and (other.candidates[0][0] == UNKNOWN or found[0].gain > rival):
             other = Event.of_answers(other.kind, other.sample, found)
-        labels = [label for label, _ in other.candidates]
-        if labels == self.told:
+        if other.tells(self.told):
             return None
-        self.told = labels
+        self.told = other.labels
         return other
 
     def _left_over(self, number: int, window: Window) -> tuple[float, float]:
@@ -476,41 +450,7 @@ class Decisions:
         most = max(logs.values())
         return {label: float(np.exp(log - most)) for label, log in logs.items()}
 
-    def _noisy_sensor(self, now: int, window: Window) -> Event | None:
-        """The sensor whose noise has most likely increased; the statistic is twice the log-likelihood gained.
-
-        More noise of one sensor increases the whitened innovations along one direction alone.
-        """
-        r, root = window.recent(min(int(window.clock[0]), window.length)), window.steady.root
-        l, n = r.shape[1], np.arange(1, len(r) + 1)[:, None]  # noqa: E741
-        along = np.cumsum((r @ (root / np.linalg.norm(root, axis=0))) ** 2, axis=0)
-        share, total = along / n, np.cumsum(np.sum(r**2, axis=1))[:, None]
-        alike = (l == 1) | (excess(total - along, np.maximum((l - 1) * n, 1)) < RULES["odd"])
-        gain = np.where((share > 1) & (n >= FEWEST) & alike, n * (share - 1 - np.log(np.maximum(share, 1.0))), 0.0)
-        if not gain.any():
-            return None
-        k, o = np.unravel_index(int(np.argmax(gain)), gain.shape)
-        return Event("isolated", now, ((f"sensor:{self.outputs[o]} noise", 1.0),), now - int(k),
-                     (float(np.sqrt(share[k, o])),), float(gain[k, o]), "size is the factor of the standard deviation")
-
 
 def _is_due(age: int, growth: float) -> bool:
     """Whether something so old is judged again, at ages that grow by a factor."""
     return age > 0 and int(np.log(age + 1) / np.log(growth)) > int(np.log(age) / np.log(growth))
-
-
-def _fading(plant: RunningFilter, energy: float, faded: float) -> int:
-    """Samples after which a transient has faded."""
-    if energy <= faded:
-        return 1
-    radius = float(np.max(np.abs(np.linalg.eigvals(plant.steady.F)), initial=0.0))
-    return 1 + int(np.ceil(np.log(faded / energy) / np.log(min(max(radius, 1e-6), 1 - 1e-6)) / 2))
-
-
-def excess(energy: Any, free: Any) -> Any:
-    """Return the excess of energies over chi-square with `free` degrees of freedom, in standard deviations.
-
-    The cube root of chi2 / free is nearly Gaussian (Wilson and Hilferty 1931).
-    """
-    spread = 2 / (9 * free)
-    return (np.cbrt(energy / free) - 1 + spread) / np.sqrt(spread)

@@ -48,6 +48,16 @@ class Event:
                    tuple(sizes.tolist()), first.gain, note)
 
     @property
+    def labels(self) -> list[str]:
+        """The labels of the candidates."""
+        return [label for label, _ in self.candidates]
+
+    def tells(self, labels: Sequence[str]) -> bool:
+        """Whether these are its labels; the order of faults at once, that of their onsets, does not count."""
+        own, others = ([set(label.split(" + ")) for label in found] for found in (self.labels, labels))
+        return own == others
+
+    @property
     def isolates(self) -> bool:
         """Whether candidates are named, or none is left."""
         return self.kind == "isolated"

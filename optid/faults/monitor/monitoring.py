@@ -18,10 +18,11 @@ from optid.faults.monitor import file
 from optid.faults.monitor.actuator_kinds import searched
 from optid.faults.monitor.arl import Calibration, calibrate
 from optid.faults.monitor.columns import SPARE, Window, columns_of
-from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
+from optid.faults.monitor.decisions import NAMING, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
 from optid.faults.monitor.healthy_noise import parameter_effect, raise_thresholds, with_noise_of, without_drift
 from optid.faults.monitor.readings import ReadingChecks
+from optid.faults.monitor.rules import RULES
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import expand
 from optid.faults.monitor.sizes import Recent

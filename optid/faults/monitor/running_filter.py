@@ -254,6 +254,13 @@ class RunningFilter:
         self.x[: self.model.nx] -= self.held[own] @ later[own]
         self.held[own] = self.held_variance[own] = 0.0
 
+    def fades_after(self, energy: float, faded: float) -> int:
+        """Return the samples after which a transient has the energy `faded`."""
+        if energy <= faded:
+            return 1
+        radius = float(np.max(np.abs(np.linalg.eigvals(self.steady.F)), initial=0.0))
+        return 1 + int(np.ceil(np.log(faded / energy) / np.log(min(max(radius, 1e-6), 1 - 1e-6)) / 2))
+
     def room(self, count: int) -> None:
         """Hold the oldest constants until there is room for so many new ones."""
         most = SPARE + 2 * int(self.columns.size.max()) - count

@@ -14,7 +14,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
-from optid.faults.diagnosis.alternatives import family_of, split_by_kind
+from optid.faults.diagnosis.alternatives import UNKNOWN_DIRECTION, family_of, split_by_kind
 from optid.faults.diagnosis.answers import Estimate, FaultAnswer
 from optid.faults.diagnosis.counting import with_model_uncertainty
 from optid.faults.diagnosis.diagnosing import diagnose
@@ -94,7 +94,8 @@ class Recent:
     def answers(self, listed: Sequence[Candidate], now: int) -> tuple[FaultAnswer, ...] | None:
         """Return the answers of a diagnosis of the samples before `now`, by two faults where no single one fits.
 
-        Onsets are samples of the stream. It is empty where nothing explains the samples, None where they are unusable.
+        Onsets are samples of the stream. It is empty where nothing that is listed explains the samples (most pairs of
+        faults look like a disturbance of unknown direction at first), None where they are unusable.
         """
         part, first = self._part(now)
         try:
@@ -104,6 +105,8 @@ class Recent:
                              model_uncertainty=self.known)
         except (DataError, StructureError):  # too few samples, or channels that are no channels of the model any more
             return None
+        if all(fault.name == UNKNOWN_DIRECTION for one in found.candidates for fault in one.faults):
+            return ()
         return tuple(replace(one, faults=tuple(replace(fault, onset=fault.onset + first) for fault in one.faults))
                      for one in found.candidates)
 

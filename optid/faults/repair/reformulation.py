@@ -18,7 +18,7 @@ from optid.faults.repair.allocation import Allocation, Target, allocate, robust_
 from optid.faults.repair.ambiguity import Ambiguity, advise
 from optid.faults.repair.damage import Damage, damages, merge_equivalent
 from optid.faults.repair.refitting import NODES, RefitPrior
-from optid.faults.repair.schedule import Schedule, refit
+from optid.faults.repair.schedule import RefitRules, Schedule, refit
 from optid.faults.repair.virtual_sensor import Observer, observer, without_sensors
 from optid.registry import Rendered
 
@@ -154,6 +154,7 @@ def reformulate(
     if data is not None and not isinstance(data, Data):
         data = record_of(model, data)
     healthy = healthy if healthy is None else record_of(model, healthy)
+    rules = RefitRules(constraints, prior, nodes, stage, solver, seed)
     bounds: dict[str, Any] = {"low": low, "high": high, "weights": weights, "solver": solver}
 
     def try_allocation(plant: "HammersteinSS") -> tuple[Allocation | None, list[str]]:
@@ -173,9 +174,7 @@ def reformulate(
         watched, schedule = damage.with_noise(model), None
         plant = damage.nominal_model(watched)
         if damage.needs_refit and data is not None:
-            plant, schedule = refit(
-                watched, without_sensors(data, damage.sensors), damage, constraints=constraints, prior=prior,
-                nodes=nodes, stage=stage, solver=solver, seed=seed, healthy=healthy)
+            plant, schedule = refit(watched, without_sensors(data, damage.sensors), damage, rules, healthy)
         allocation, notes = try_allocation(plant)
         if damage.needs_refit and data is None:
             notes.append("no record: the plant has the sizes of the diagnosis")

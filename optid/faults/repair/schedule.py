@@ -70,20 +70,31 @@ class Schedule:
         return "\n".join([*lines, *(str(values) for values in self.values)])
 
 
-def refit(
-    model: "HammersteinSS", data: Data, damage: Damage, *, constraints: Sequence[Any] | str = "default",
-    prior: RefitPrior | None = None, nodes: int = NODES, stage: str = "auto", solver: Any = "auto", seed: int = 0,
-    healthy: Data | None = None,
-) -> tuple["HammersteinSS", Schedule]:
+@dataclass(frozen=True)
+class RefitRules:
+    """How a damaged part is refitted; the attributes are arguments of `reformulate`."""
+
+    constraints: Sequence[Any] | str = "default"
+    prior: RefitPrior | None = None
+    nodes: int = NODES
+    stage: str = "auto"
+    solver: Any = "auto"
+    seed: int = 0
+
+
+def refit(model: "HammersteinSS", data: Data, damage: Damage, rules: RefitRules, healthy: Data | None = None
+          ) -> tuple["HammersteinSS", Schedule]:
     """Refit what a fault broke, or all parameters where that predicts held-out samples better.
 
-    Arguments other than the damage are those of `reformulate`. A repair that is not offered leaves the model as it was.
+    The model, the data and `healthy` are those of `reformulate`. A repair that is not offered leaves the model as it
+    was.
 
     Warns:
         DataWarning: too few samples for a refit, with the least number; part of the input range that no sample visits.
     """
+    nodes, stage = rules.nodes, rules.stage
     try:
-        narrow = refitting(model, data, damage, prior=prior, nodes=nodes)
+        narrow = refitting(model, data, damage, prior=rules.prior, nodes=nodes)
     except RankError as error:
         warnings.warn(f"{damage.label}: no refit. {error}", DataWarning, stacklevel=3)
         counted = sum(1 if i in damage.dead else nodes for i in damage.columns) + sum(
@@ -92,7 +103,7 @@ def refit(
         none = Schedule("prior", after, -(-counted // model.l), {}, (), {}, None, (), None,
                         "too few for a refit: the model is that of the diagnosis")
         return damage.nominal_model(model), none
-    if prior is None and narrow.curves:  # of the curvatures the one that makes the record most probable
+    if rules.prior is None and narrow.curves:  # of the curvatures the one that makes the record most probable
         tried = [replace(narrow, prior=replace(narrow.prior, curvature=curvature)) for curvature in BENDS]
         narrow = max(tried, key=Refitting.evidence)
     scores: dict[str, float] = {}
@@ -108,13 +119,13 @@ def refit(
             readings = max(1, int(last.present[-samples:].sum()))
             for word in STAGES:
                 problem = replace(narrow, whole=word == "all with prior")
-                tried_on[word] = _solved(problem.held_out(samples), constraints, solver)
+                tried_on[word] = _solved(problem.held_out(samples), rules)
                 theta = tried_on[word].model.theta
                 scores[word] = float(np.sum(problem.linearise(theta)[0][-readings:] ** 2)) / readings
             better = scores["affected only"] - scores["all with prior"] > MARGIN / readings
             stage, reason = STAGES[int(better)], "by hold-out"
     problem = replace(narrow, whole=stage == "all with prior")
-    found = _solved(problem, constraints, solver)
+    found = _solved(problem, rules)
     before, theta = model, found.model.theta
     sensitivities = problem.linearise(theta)[1]
     covariance = problem.covariance(sensitivities)
@@ -134,7 +145,7 @@ def refit(
     least = -(-sum(curve.values_open for curve in curves) // model.l)
     promised = None
     if narrow.samples >= FEWEST:
-        trial = tried_on.get(stage) or _solved(problem.held_out(samples), constraints, solver)
+        trial = tried_on.get(stage) or _solved(problem.held_out(samples), rules)
         raw = in_units_of(before, data)
         ends, first = raw.select(experiments=raw.n_experiments - 1), raw.select(experiments=0)
         held = ends.window(ends.n_samples - samples, ends.n_samples)
@@ -144,7 +155,8 @@ def refit(
             repaired, unrepaired = errors(_plant(problem, trial.model.theta), held), errors(before, held)
             promised = Promise(
                 before.outputs, upper_rms(np.full((1, before.l), np.nan) if sound is None else errors(before, sound)),
-                upper_rms(repaired), rms(unrepaired), rms(repaired), _spread(problem, theta, covariance, ends, seed),
+                upper_rms(repaired), rms(unrepaired), rms(repaired),
+                _spread(problem, theta, covariance, ends, rules.seed),
                 np.sqrt(np.diag(problem.steady.covariance)), not model.is_stable)
     refused = promised is not None and bool(promised.refusal)
     schedule = Schedule("none" if refused else stage, problem.samples, least, scores, curves, offsets, promised, active,
@@ -162,13 +174,13 @@ def _plant(problem: Refitting, theta: Array) -> "HammersteinSS":
     return model
 
 
-def _solved(problem: Refitting, constraints: Sequence[Any] | str, solver: Any) -> Any:
+def _solved(problem: Refitting, rules: RefitRules) -> Any:
     from optid.errors import SolverFailed
     from optid.registry import fault_formulation
     from optid.solving.solve import run
 
     name = "refit.parameters" if problem.whole else "refit.actuator"
-    found = run(fault_formulation(name)(problem, constraints=constraints), solver)
+    found = run(fault_formulation(name)(problem, constraints=rules.constraints), rules.solver)
     if found.model is None or found.solution.status.value in ("failed", "infeasible", "unbounded"):
         why = found.solution.reason or found.solution.claimed
         raise SolverFailed(f"the refit found no feasible point ({found.solution.status}: {why}): no model")
