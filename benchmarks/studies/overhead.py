@@ -64,7 +64,7 @@ def watched(described: Study, number: int) -> tuple[list[tuple[float, dict]], fl
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
         running.run(described, Path(folder) / "study.sqlite", progress=progress,
-                    execute=partial(run_here, workers=number))
+                    executor=partial(run_here, workers=number))
         return came, started, time.perf_counter()
 
 
@@ -132,7 +132,7 @@ def by_cpu(count: int) -> None:
     rows = [{**made, "key": cell.key} for cell in cells(described)]
     with tempfile.TemporaryDirectory() as folder:
         clock = time.process_time()
-        running.run(described, Path(folder) / "study.sqlite", execute=lambda todo: iter(rows))
+        running.run(described, Path(folder) / "study.sqlite", executor=lambda todo: iter(rows))
         print(f"grid and database: {1e3 * (time.process_time() - clock) / ROWS:.1f} CPU ms a row, {ROWS} rows")
 
 

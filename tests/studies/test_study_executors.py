@@ -98,9 +98,9 @@ def test_a_cell_whose_worker_always_dies_is_a_row_that_the_next_run_replaces(cli
             killer.submit(kill_all)
             yield from run_with(client.get_executor(), cells, behave)
 
-    running.run(SMALL, db, progress=follow, execute=execute)
+    running.run(SMALL, db, progress=follow, executor=execute)
     assert list(read_rows(db)["outcome"]) == ["killed"]
-    running.run(SMALL, db, execute=lambda cells: iter([row(cells[0])]))
+    running.run(SMALL, db, executor=lambda cells: iter([row(cells[0])]))
     assert list(read_rows(db)["outcome"]) == ["done"]
 
 
@@ -129,7 +129,7 @@ def test_an_executor_that_breaks_loses_no_row(tmp_path, monkeypatch):
                 os.kill(next(iter(executor._processes)), signal.SIGKILL)
 
         with pytest.raises(StudyError, match="the executor broke .*rows so far are kept"):
-            running.run(SMALL, tmp_path / "s.sqlite", progress=follow, execute=partial(run_with, executor,
+            running.run(SMALL, tmp_path / "s.sqlite", progress=follow, executor=partial(run_with, executor,
                                                                                         function=behave))
     assert 3 <= len(read_rows(tmp_path / "s.sqlite")["key"]) < 40
 

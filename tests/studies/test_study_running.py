@@ -65,13 +65,13 @@ def test_a_second_run_recomputes_nothing(path, grid):
     grid([cell(k) for k in range(10)])
     seen = []
     hands = Hands()
-    rows = run(STUDY, path, execute=hands, progress=lambda *found: seen.append((*found, len(finished_rows(path)))))
+    rows = run(STUDY, path, executor=hands, progress=lambda *found: seen.append((*found, len(finished_rows(path)))))
     assert hands.ran == list(range(10)) and [int(r["key"], 16) for r in rows] == hands.ran
     assert seen[0] == (0, 10, None, 0) and [one[2] for one in seen[1:]] == rows  # given back as they were made
     assert [(done, total, there) for done, total, _, there in seen] == [(k, 10, k) for k in range(11)]
     grid([cell(k) for k in range(12)])
     again = Hands()
-    rows = run(STUDY, path, execute=again)
+    rows = run(STUDY, path, executor=again)
     assert again.ran == [10, 11] and len(rows) == 12 and tuple(rows[0]) == NAMES
     assert sorted(p.name for p in path.parent.iterdir()) == ["study.sqlite"]
 
@@ -81,10 +81,10 @@ def test_what_is_finished_is_kept_when_something_stops_the_run(path, grid, error
     grid([cell(k) for k in range(10)])
     hands = Hands(4, error)
     with pytest.raises(error):
-        run(STUDY, path, execute=hands)
+        run(STUDY, path, executor=hands)
     assert hands.closed and len(finished_rows(path)) == 4
     rest = Hands()
-    run(STUDY, path, execute=rest)
+    run(STUDY, path, executor=rest)
     assert rest.ran == [4, 5, 6, 7, 8, 9] and len(finished_rows(path)) == 10
 
 
@@ -97,13 +97,13 @@ def test_an_error_of_the_caller_s_progress_keeps_what_is_finished(path, grid):
 
     hands = Hands()
     with pytest.raises(OSError):
-        run(STUDY, path, execute=hands, progress=progress)
+        run(STUDY, path, executor=hands, progress=progress)
     assert hands.closed and len(finished_rows(path)) == 3
 
 
 def test_rows_nobody_asked_for_and_doubles_are_left_out(path, grid):
     grid([cell(k) for k in range(3)])
-    rows = run(STUDY, path, execute=lambda todo: iter([row(c) for c in [*todo, cell(7), *todo]]))
+    rows = run(STUDY, path, executor=lambda todo: iter([row(c) for c in [*todo, cell(7), *todo]]))
     assert len(rows) == 3 == len(finished_rows(path))
 
 
@@ -122,23 +122,23 @@ def test_settings_that_make_no_sense_are_refused_before_the_database_is_made(pat
 def test_cells_that_come_back_without_a_row_are_told(path, grid):
     grid([cell(k) for k in range(3)])
     with pytest.raises(StudyError, match="2 cells of 3 returned no row"):
-        run(STUDY, path, execute=lambda todo: iter([row(todo[0])]))
+        run(STUDY, path, executor=lambda todo: iter([row(todo[0])]))
     assert len(finished_rows(path)) == 1
 
 
 def test_refused_cells_need_no_worker(path, grid):
     grid([replace(cell(0), refusal="not installed: pip install x"), cell(1)])
     hands = Hands()
-    rows = run(STUDY, path, execute=hands)
+    rows = run(STUDY, path, executor=hands)
     assert hands.ran == [1] and [r["outcome"] for r in rows] == ["refused", "done"]
 
 
 def test_outcomes_are_retried_on_request(path, grid):
     grid([cell(k) for k in range(4)])
-    run(STUDY, path, execute=lambda todo: iter([row(c, outcome="done" if k else "crashed")
+    run(STUDY, path, executor=lambda todo: iter([row(c, outcome="done" if k else "crashed")
                                                 for k, c in enumerate(todo)]))
     hands = Hands()
-    assert [r["outcome"] for r in run(STUDY, path, execute=hands, retry=["crashed"])] == ["done"] * 4
+    assert [r["outcome"] for r in run(STUDY, path, executor=hands, retry=["crashed"])] == ["done"] * 4
     assert hands.ran == [0]
     with closing(sqlite3.connect(path)) as connection, connection:
         assert connection.execute("SELECT outcome FROM superseded").fetchall() == [("crashed",)]
@@ -148,32 +148,32 @@ def test_what_is_retried_is_not_taken_over_from_another_study(path, grid):
     cells = grid([cell(k) for k in range(3)])
     other = replace(STUDY, name="another")
     outcomes = ("crashed", "time limit", "done")
-    run(STUDY, path, execute=lambda todo: iter([row(c, outcome=o) for c, o in zip(todo, outcomes)]))
+    run(STUDY, path, executor=lambda todo: iter([row(c, outcome=o) for c, o in zip(todo, outcomes)]))
     grid([replace(c, study="another") for c in cells])
-    assert [r["outcome"] for r in run(other, path, execute=Hands())] == list(outcomes)
+    assert [r["outcome"] for r in run(other, path, executor=Hands())] == list(outcomes)
     grid(cells)
     hands = Hands()
-    assert [r["outcome"] for r in run(STUDY, path, execute=hands, retry="crashed")] == ["done", "time limit", "done"]
+    assert [r["outcome"] for r in run(STUDY, path, executor=hands, retry="crashed")] == ["done", "time limit", "done"]
     assert hands.ran == [0]
     grid([replace(c, study="third") for c in cells])
-    rows = run(replace(STUDY, name="third"), path, execute=hands)
+    rows = run(replace(STUDY, name="third"), path, executor=hands)
     assert [r["outcome"] for r in rows] == ["done", "time limit", "done"]  # of two rows the one that is done
     assert hands.ran == [0]
 
 
 def test_other_labels_and_other_studies_take_over_what_is_there(path, grid):
     cells = grid([cell(k) for k in range(4)])
-    run(STUDY, path, execute=Hands())
+    run(STUDY, path, executor=Hands())
     grid([replace(c, solver="renamed") for c in cells])
     hands = Hands()
-    rows = run(STUDY, path, execute=hands)
+    rows = run(STUDY, path, executor=hands)
     assert hands.ran == [] and {r["solver"] for r in rows} == {"renamed"} and len(finished_rows(path)) == 4
     grid([replace(c, study="another") for c in cells])
-    rows = run(replace(STUDY, name="another"), path, execute=hands)
+    rows = run(replace(STUDY, name="another"), path, executor=hands)
     assert hands.ran == [] and {r["study"] for r in rows} == {"another"}
     assert [len(finished_rows(path, name)) for name in ("trouble", "another")] == [4, 4]
     before = read_rows(path)["started"].size
-    run(replace(STUDY, name="another"), path, execute=hands)
+    run(replace(STUDY, name="another"), path, executor=hands)
     assert read_rows(path)["started"].size == before == 8
 
 
@@ -188,26 +188,26 @@ def changed(count):
 def test_changed_data_are_refused_unless_told(path, grid):
     old, new, made = changed(3)
     grid(old)
-    run(STUDY, path, execute=made)
+    run(STUDY, path, executor=made)
     grid(new)
     with pytest.raises(StudyError, match="data changed since the last run.*\n.*mine: /somewhere/x.csv"):
-        run(STUDY, path, execute=made)
-    rows = run(STUDY, path, execute=made, accept_changed_data=True)
+        run(STUDY, path, executor=made)
+    rows = run(STUDY, path, executor=made, accept_changed_data=True)
     assert {r["data_hash"] for r in rows} == {"b" * 64} and len(finished_rows(path)) == 3
-    run(STUDY, path, execute=made)
+    run(STUDY, path, executor=made)
 
 
 def test_changed_data_stay_accepted_when_an_entry_was_taken_out(path, grid):
     old, new, made = changed(2)
     grid(old)
-    run(STUDY, path, execute=made)
+    run(STUDY, path, executor=made)
     grid(new[:1])
     for accepted in (True, False):
-        run(STUDY, path, execute=made, accept_changed_data=accepted)
+        run(STUDY, path, executor=made, accept_changed_data=accepted)
         assert set(read_rows(path)["data_hash"]) == {"b" * 64}
     grid(old)
     hands = Hands()
-    run(STUDY, path, execute=hands, accept_changed_data=True)
+    run(STUDY, path, executor=hands, accept_changed_data=True)
     assert hands.ran == []  # the former content again: its rows were kept
 
 
@@ -216,7 +216,7 @@ def test_an_entry_that_is_taken_out_leaves_the_report_and_comes_back_without_a_r
     for now in (cells, cells[::2], cells):
         grid(now)
         hands = Hands()
-        rows = run(STUDY, path, execute=hands)
+        rows = run(STUDY, path, executor=hands)
         assert [r["key"] for r in rows] == [c.key for c in now]
         assert set(read_rows(path)["solver"]) == {c.solver for c in now}
     assert hands.ran == []
@@ -230,11 +230,11 @@ def test_two_runs_of_a_study_at_once_are_refused_and_two_studies_are_not(path, t
     with Store(path, write=True) as store, store.claim(STUDY.name):
         for name in (path, link):
             with pytest.raises(DatabaseError, match=f"another run of 'trouble' .*: process {os.getpid()} on .* since"):
-                run(STUDY, name, execute=Hands())
+                run(STUDY, name, executor=Hands())
         grid([replace(c, study="another") for c in cells])
-        assert len(run(replace(STUDY, name="another"), path, execute=Hands())) == 1
+        assert len(run(replace(STUDY, name="another"), path, executor=Hands())) == 1
     grid(cells)
-    assert len(run(STUDY, path, execute=Hands())) == 1
+    assert len(run(STUDY, path, executor=Hands())) == 1
 
 
 @pytest.mark.parametrize("year, free", [(2026, True), (2999, False)])
@@ -244,10 +244,10 @@ def test_a_run_on_another_machine_holds_its_study_while_it_writes_rows(path, gri
         connection.execute("INSERT INTO runs VALUES ('trouble', 'elsewhere', 1, '2026-01-01', ?)",
                            [f"{year}-01-01T00:00:00+00:00"])
     if free:
-        assert len(run(STUDY, path, execute=Hands())) == 1
+        assert len(run(STUDY, path, executor=Hands())) == 1
     else:
         with pytest.raises(DatabaseError, match="process 1 on elsewhere"):
-            run(STUDY, path, execute=Hands())
+            run(STUDY, path, executor=Hands())
 
 
 def test_the_study_of_a_killed_run_is_free(path, grid):
@@ -261,16 +261,16 @@ with Store({str(path)!r}, write=True) as store, store.claim("trouble"):
     with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None and holder.stdout.readline() == b"held\n"
         with pytest.raises(DatabaseError, match=f"process {holder.pid} on"):
-            run(STUDY, path, execute=Hands())
+            run(STUDY, path, executor=Hands())
         holder.kill()
         holder.wait()
-    assert len(run(STUDY, path, execute=Hands())) == 1
+    assert len(run(STUDY, path, executor=Hands())) == 1
 
 
 def test_what_would_be_run_changes_nothing(path, grid):
     cells = grid([cell(k) for k in range(5)])
     assert [len(found) for found in running.plan(STUDY, path)[:2]] == [5, 5] and not path.exists()
-    run(STUDY, path, execute=Hands())
+    run(STUDY, path, executor=Hands())
     grid(cells[2:])
     before = path.read_bytes()
     every, todo, former = running.plan(STUDY, path, retry="done")
@@ -289,39 +289,39 @@ from study_trouble import cell
 from optid.studies.execution import running
 from test_study_running import STUDY, Hands
 running.cells = lambda study: [cell(k) for k in range(5)]
-running.run(STUDY, {str(link)!r}, execute=Hands(),
+running.run(STUDY, {str(link)!r}, executor=Hands(),
             progress=lambda done, total, found: os.kill(os.getpid(), 9) if done == 3 else None)
 """
     assert subprocess.run([sys.executable, "-c", program]).returncode == -9
     grid([cell(k) for k in range(5)])
     rest = Hands()
-    assert len(run(STUDY, path, execute=rest)) == 5 and rest.ran == [3, 4]
+    assert len(run(STUDY, path, executor=rest)) == 5 and rest.ran == [3, 4]
     assert link.is_symlink()
 
 
 def test_another_version_is_refused_before_anything_is_run(path, grid):
     grid([cell(0)])
-    run(STUDY, path, execute=Hands())
+    run(STUDY, path, executor=Hands())
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("UPDATE meta SET value = '99' WHERE name = 'schema version'")
     grid([cell(1)])
     hands = Hands()
     with pytest.raises(DatabaseError, match="schema version 99"):
-        run(STUDY, path, execute=hands)
+        run(STUDY, path, executor=hands)
     assert hands.ran == [] and sorted(p.name for p in path.parent.iterdir()) == ["study.sqlite"]
 
 
 def test_a_folder_that_is_not_there_is_told(tmp_path, grid):
     grid([cell(0)])
     with pytest.raises(DatabaseError, match="cannot be written: No such file or directory"):
-        run(STUDY, tmp_path / "nowhere" / "x.sqlite", execute=Hands())
+        run(STUDY, tmp_path / "nowhere" / "x.sqlite", executor=Hands())
 
 
 def test_frames(path, grid):
     pd = pytest.importorskip("pandas")
     grid([cell(k) for k in range(3)])
     for db in (path, None):
-        frame = run_to_frame(STUDY, db, execute=Hands())
+        frame = run_to_frame(STUDY, db, executor=Hands())
         assert tuple(frame.columns) == NAMES and len(frame) == 3
         assert frame["objective"].isna().all() and frame["objective"].dtype == float
         assert frame["reached"].dtype == bool and frame["unknowns"].dtype == "Int64"
@@ -332,7 +332,7 @@ def test_every_trouble_in_one_study(path, grid):
     ways = ["fine", "segfault", "fine", "loop", "hog", "leave", "raise", "fine", "partial", "fine"]
     limits = {"loop": {"time_limit": 0.5}, "hog": {"memory_limit": 500.0}}
     grid([cell(k, do, **limits.get(do, {})) for k, do in enumerate(ways)])
-    rows = run(STUDY, path, execute=partial(run_here, function=behave, workers=2))
+    rows = run(STUDY, path, executor=partial(run_here, function=behave, workers=2))
     assert [r["outcome"] for r in rows] == ["done", "crashed", "done", "time limit", "memory limit", "crashed", "error",
                                             "done", "error", "done"]
     assert all(r["reason"] for r in rows if r["outcome"] != "done")
@@ -379,7 +379,7 @@ from test_study_running import STUDY
 slow = int(sys.argv[1])  # these last until the kill
 running.cells = lambda study: [cell(k, seconds=0.02 if k < slow else 600.0, time_limit=900.0, log={log!r})
                                for k in range({count})]
-running.run(STUDY, {path!r}, execute=partial(run_here, function=behave, workers=2))
+running.run(STUDY, {path!r}, executor=partial(run_here, function=behave, workers=2))
 """
 
 
@@ -402,7 +402,7 @@ def test_killed_at_any_moment_and_run_again_every_cell_is_there_once(path, tmp_p
         if path.exists():
             assert len(finished_rows(path)) <= begun()  # it opens
     cells = grid([cell(k, seconds=0.0, log=str(log)) for k in range(count)])
-    rows = run(STUDY, path, execute=partial(run_here, function=behave, workers=2))
+    rows = run(STUDY, path, executor=partial(run_here, function=behave, workers=2))
     assert [r["key"] for r in rows] == [c.key for c in cells] and len(finished_rows(path)) == count
     assert begun() <= count + 3 * 4  # run twice: at most what three kills found in flight, with one waiting each
 
@@ -422,7 +422,7 @@ signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, resource.RLIM_INFINITY))
 hands = Hands()
 try:
-    running.run(STUDY, {str(path)!r}, execute=hands)
+    running.run(STUDY, {str(path)!r}, executor=hands)
 except DatabaseError as error:
     print(hands.closed, len(hands.ran), error)
 """
@@ -436,5 +436,5 @@ except DatabaseError as error:
     assert len(finished_rows(path)) == int(kept[1].replace(",", "")) == int(ran) - 1
     grid([cell(k) for k in range(3000)])
     rest = Hands()
-    assert len(run(STUDY, path, execute=rest)) == 3000
+    assert len(run(STUDY, path, executor=rest)) == 3000
     assert len(rest.ran) + int(ran) == 3001  # the row for which there was no room is made again

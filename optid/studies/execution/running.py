@@ -26,9 +26,9 @@ Execution = Callable[[Sequence[Cell]], Iterator[Row]]
 Progress = Callable[[int, int, Row | None], None]
 
 
-def run(study: Definition, db: str | Path, *, workers: int | None = None, executor: Executor | None = None,
-        progress: Progress | None = None, accept_changed_data: bool = False, retry: str | Sequence[str] = (),
-        execute: Execution | None = None) -> list[Row]:
+def run(study: Definition, db: str | Path, *, workers: int | None = None, executor: Executor | Execution | None = None,
+        progress: Progress | None = None, accept_changed_data: bool = False, retry: str | Sequence[str] = ()
+        ) -> list[Row]:
     """Run the cells of a study that have no row yet.
 
     Args:
@@ -36,12 +36,12 @@ def run(study: Definition, db: str | Path, *, workers: int | None = None, execut
         db: the database; made when it is not there.
         workers: processes on this machine; one per core when not given.
         executor: of `concurrent.futures`, or one like it such as Dask's ``Client(...).get_executor()``, whose workers
-            run the cells instead; they must see data files under the same path, and have the same versions.
+            run the cells instead; they must see data files under the same path, and have the same versions. Or an
+            `Execution` of your own.
         progress: called with (cells that have a row, all cells, None) before work starts and with the row after each.
         accept_changed_data: run cells again whose data file is not what it was; their former rows are set aside.
         retry: outcomes whose rows are set aside and run again, such as "crashed" or "time limit"; rows of other
             studies with such an outcome are not taken over.
-        execute: another way to run cells, in place of ``workers`` and ``executor``.
 
     Returns:
         The rows of all cells of the study, in the order of its grid.
@@ -57,8 +57,10 @@ def run(study: Definition, db: str | Path, *, workers: int | None = None, execut
     grid = cells(study)
     if workers is not None and executor is not None:
         raise StudyError("workers are processes of this machine, an executor has its own: leave one of them out")
-    execute = execute or (partial(run_here, workers=available_cores(workers, "workers", StudyError))
-                          if executor is None else partial(run_with, executor))
+    if executor is None:
+        execute: Execution = partial(run_here, workers=available_cores(workers, "workers", StudyError))
+    else:
+        execute = executor if callable(executor) else partial(run_with, executor)
     with Store(db, write=True) as store, store.claim(study.name):
         todo = _prepared(store, study, grid, accept_changed_data, retry)
         store.describe(study.name, _description(study))
