@@ -241,6 +241,7 @@ def dense_gain(s, limits, members):
     return fitted @ fitted - sum(limits.q[s.labels.index(label)] for label, _ in members)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size, missing", [(1, 0.0), (2, 0.2), (3, 0.0)])
 def test_equal_to_brute_force_over_all_subsets(found, limits, size, missing):
     faults = [Fault.step("sensor:y1", 12, 0.5), Fault.jump("state", 20, [0.8, -0.8, 0.4]),

@@ -45,6 +45,7 @@ def test_the_inverse_of_a_controller_is_not_monitored():
         lambda: Monitor(inverse, uncertainty=record), lambda: model_uncertainty(inverse, record))))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The model is unstable")
 def test_a_regulated_plant_is_fitted_without_feedthrough_and_the_advice_is_taken():
     record = regulated()
@@ -73,6 +74,7 @@ def curved(count, seed, share=0.0, onset=0):
     return optid.Data(u, y, inputs=["valve"], outputs=["level"])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The plant is not of the class of the model")
 def test_the_curvature_of_a_plant_under_control_passes_less_for_that_of_its_valve(monkeypatch):
     """Diagnosis and monitor estimate by one formula; a plant of the class of the model has no products."""
@@ -244,6 +246,7 @@ def test_what_operators_do_to_a_monitor(tmp_path):
         assert one.samples == 500 and not one.run(u[500:], y[500:])
 
 
+@pytest.mark.slow
 def test_a_slow_disturbance_is_followed_and_a_fault_is_still_found():
     model, u, y = controlled(count=4000, onset=10_000)
     y += 0.5 * np.sin(2 * np.pi * np.arange(4000) / 2000)[:, None]

@@ -119,6 +119,7 @@ def excited(seed, f):
     return optid.Data(u[50:], (y / y.std() + 10 ** rng.uniform(-2, 0) * rng.standard_normal(250))[50:])
 
 
+@pytest.mark.slow
 def test_a_descent_from_moved_poles_that_fell_without_arriving_is_gone_on_from():
     fit = optid.fit(excited(12, lambda v: v), "ss.exact", nx=2, constraints=["stable:0.7"])
     assert fit.solution.status is Status.LOCAL

@@ -183,6 +183,7 @@ def test_constrained_optimum_equals_that_of_ipopt_on_the_same_problem():
     assert prices["stable:0.8"].binding and prices["stable:0.8"].fit_points > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["osqp", "piqp", "ipopt", "scs"])
 def test_any_back_end_for_the_class_solves_the_programmes(solver):
     data = record(count=200)

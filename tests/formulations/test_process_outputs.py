@@ -222,6 +222,7 @@ def test_a_model_is_judged_at_irregular_times():
     assert wrong.verdict.word == "poor" and failed >= {"independence of the inputs", "error that the inputs explain"}
 
 
+@pytest.mark.slow
 def test_a_search_at_irregular_times_tries_processes():
     rng = np.random.default_rng(4)
     t = np.cumsum(rng.uniform(0.3, 1.7, 160))
@@ -285,6 +286,7 @@ def test_impossible_times_are_refused(times, message):
         optid.Data(np.arange(3.0), np.arange(3.0), times=times)
 
 
+@pytest.mark.slow
 def test_the_command_takes_stamps_as_they_are(tmp_path):
     from typer.testing import CliRunner
 

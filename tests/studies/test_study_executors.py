@@ -32,6 +32,7 @@ def by_key(found, todo):
     return rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [
     lambda: ThreadPoolExecutor(2), lambda: ProcessPoolExecutor(2, mp_context=get_context("spawn"))])
 def test_rows_are_those_of_one_machine(make):
