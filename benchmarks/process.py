@@ -319,7 +319,7 @@ def main():
     if "peers" in parts:
         peers(min(given.runs, 100))
     if "order" in parts:
-        order(min(given.runs, 20))
+        order(min(given.runs, 50))
 
 
 if __name__ == "__main__":
