@@ -622,7 +622,7 @@ def test_simulations_that_cannot_be():
     with pytest.raises(LookupFailed, match="'thruster'"):
         simulate("truster")
     for samples, noise in ((0, 0.1), (10, -1.0), (10, float("nan"))):
-        with pytest.raises(optid.errors.DataError, match="at least one sample"):
+        with pytest.raises(optid.errors.DataError, match="samples must be positive"):
             simulate("thruster", samples, noise)
 
 
