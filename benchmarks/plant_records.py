@@ -299,7 +299,7 @@ SHORT = (150, 600)
 
 OPEN_KINDS = {
     **{f"open: {one}": Recipe(one) for one in ("staircase", "PRBS", "smooth", "several steps", "slow set-points",
-                                              "sine", "few sines", "time")},
+                                               "sine", "few sines", "time")},
     **{f"open: {one}": Recipe(one, samples=(150, 400)) for one in ("one step", "bump")},
     **{f"open: {one}": Recipe("staircase", one) for one in (*ORDERS[1:], "resonant", "inverse response",
                                                             "integrating")},
@@ -385,7 +385,7 @@ BAD_KINDS = {
 LONG_KINDS = {f"long: {one}": Recipe(one, plant, samples=(3000, 3000), curve=curve) for one, plant, curve in (
     ("staircase", "second order", "saturation"), ("PRBS", "second order", ""), ("one step", "first order", ""),
     ("smooth", "resonant", ""))} | {f"long: PI loop, {one}": replace(_LOOP, controller="PI", setpoint=one,
-                                                                    samples=(3000, 3000))
+                                                                     samples=(3000, 3000))
                                     for one in ("steps", "constant")}
 
 KINDS: dict[str, Recipe] = {

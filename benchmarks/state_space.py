@@ -117,7 +117,7 @@ CASES: dict[str, tuple[Callable[..., Any], int, str, dict[str, Any]]] = {
     "hammerstein-wiener": (lambda rng: block(rng, True, True), 1, "hammerstein_wiener_ss.exact", {"nx": 2}),
     "wiener": (lambda rng: block(rng, False, True), 1, "wiener_ss.exact", {"nx": 2}),
     "two by two": (two_by_two, 2, "lfr.exact", {"nx": 4, "channels": 2, "latent": "states",
-                                               "latent_basis": "bspline:8"}),
+                                                "latent_basis": "bspline:8"}),
 }
 
 

@@ -16,6 +16,7 @@ levels = {"h1": (0, None), "h2": (0, None)}  # roots stay defined
 plant = optid.Equations(torricelli, states={"h1": 1, "h2": 1}, bounds=levels,
                         parameters={"pump": 1, "upper": 1, "lower": 1})
 
+
 def main() -> dict[str, float]:
     """Return the parameters, and the change of the level at rest per volt around 1 V."""
     case = example("two_tanks")

@@ -1,4 +1,4 @@
-"""The catalogue of identification problems: one file per problem, each entry returns a Program or a Procedure."""
+"""The catalogue of identification problems: one file per problem, each entry returns a Problem or a Procedure."""
 
 from optid.lazy import on_first_use
 

@@ -165,7 +165,7 @@ def repairs(plant: str, runs: int) -> None:
 BROKEN = ("loss", ONSET, 0.1), ("loss", ONSET, 0.2), ("stuck", ONSET, 0.0), ("offset", ONSET, 0.1), (
     "offset", ONSET, -0.1)
 FIGURES: dict[str, Callable[[str, int], None]] = {"kinds": kinds, "parts": parts, "alarms": alarms, "sizes": sizes,
-                                                       "repairs": repairs}
+                                                  "repairs": repairs}
 
 
 def main() -> None:

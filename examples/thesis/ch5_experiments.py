@@ -31,7 +31,7 @@ def measured(u: np.ndarray) -> optid.Data:
 def main(folder: Path) -> dict[str, float]:
     """Return the errors in % of every experiment and method, inf without a model; save figures 5.7 to 5.14."""
     found, records = {}, {f"{i} {kind}": measured(plants.pendulum_input(kind, 4000, 1))
-                         for i, kind in ((1, "sinusoid"), (2, "chirp"), (3, "noise"), (3, "levels"))}
+                          for i, kind in ((1, "sinusoid"), (2, "chirp"), (3, "noise"), (3, "levels"))}
     shaped = optid.design(records["2 chirp"].window(0, 4000), "chirp", band=(0.1, 4), amplitude=(-8, 8), shaped=True)
     records |= {"4 noise, scaled": records["3 noise"].scale(), "4 levels, scaled": records["3 levels"].scale(),
                 "4 chirp, scaled and shaped": measured(shaped.u[:, 0]).scale()}

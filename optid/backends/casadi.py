@@ -242,7 +242,7 @@ def solve_with(name: str, problem: Problem, settings: Settings) -> Answer:
         chosen["ipopt.max_iter"] = FAR
     graph = get_or_make(posed, "casadi", lambda: translate(form))
     solver = get_or_make(posed, (name, repr(sorted(chosen.items()))),
-                  lambda: ca.nlpsol("solver", name, graph, chosen))
+                         lambda: ca.nlpsol("solver", name, graph, chosen))
     compiling = time.perf_counter() - clock
     lower, upper = form.bounds
     row_lower, row_upper = form.row_bounds

@@ -19,6 +19,7 @@ from optid.structures.rank_one import Point, RankOne
 
 MAX_SIZE = 700  # multipliers up to which the semidefinite relaxation is tried
 
+
 @dataclass
 class Lifted:
     """Constraints in the two forms a certificate understands."""
@@ -32,7 +33,7 @@ class Lifted:
         """Append rows ``rows @ z <= right`` or ``=``."""
         old = self.linear
         self.linear = LinearRows(np.vstack([old.rows, rows]), np.append(old.right, right),
-                             np.append(old.equality, np.full(len(rows), equal)))
+                                 np.append(old.equality, np.full(len(rows), equal)))
 
     def add_products(self, problem: RankOne) -> list[int]:
         """Turn constraints on both factors of a block into rows on Theta, and return the blocks with some on b alone.

@@ -20,6 +20,7 @@ study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich
 
 NOTHING_SOLVED = 4  # exit code of a run in which no cell has an answer, as where one fit fails in its solver
 
+
 def run(file: File = None, example: bool = False, db: File = None, workers: int | None = None,
         scheduler: str | None = None, accept_changed_data: bool = False, retry: Words = None, export: File = None,
         dry_run: bool = False) -> None:

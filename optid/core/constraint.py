@@ -258,7 +258,6 @@ class ConstraintReader:
         return Constraint(name, replace(limit, sizes=sizes), cone, rows, right / sizes, moving, number)
 
 
-
 def _in_cone(member: Member) -> tuple[Any, str]:
     """Return what a member holds in a cone, and the cone; None for a cone that is not read."""
     if isinstance(member, PSD):

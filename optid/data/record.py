@@ -427,7 +427,7 @@ class Data(Ports):
             return self
         if self not in _RAW:
             _RAW[self] = self.map_signals(self.transform.raw_u, self.transform.raw_y,
-                                     transform=Transform.identity(self.m, self.l))
+                                          transform=Transform.identity(self.m, self.l))
         return _RAW[self]
 
     def with_findings(self, findings: Iterable[str]) -> "Data":

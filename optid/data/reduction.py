@@ -51,7 +51,7 @@ def map_parts(function: Callable[[One], Result], parts: Iterable[One], threads: 
 
 
 def reduce_parts(parts: Sequence[Part], leaf: Callable[[Part], Result], merge: Callable[[Sequence[Result]], Result],
-            scheduler: Any = None, threads: int = 1) -> Result:
+                 scheduler: Any = None, threads: int = 1) -> Result:
     """Return the merged results of all parts.
 
     Args:

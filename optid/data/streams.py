@@ -120,7 +120,7 @@ class Stream(Ports):
         return found
 
     def reduce(self, leaf: Callable[[Part, Iterable[Chunk]], Result], merge: Callable[[Sequence[Result]], Result],
-                threads: int = 1) -> Result:
+               threads: int = 1) -> Result:
         """Reduce the parts, each with its chunks, where they are stored; see `optid.data.reduction.reduce_parts`."""
         return reduce_parts(self.parts, partial(_of_part, leaf, self._channels), merge, self.scheduler, threads)
 
@@ -153,7 +153,7 @@ class Stream(Ports):
         channels = replace(self._channels, units=None)
         if self.parts:
             found = reduce_parts(self.parts, partial(_of_part, survey_part, channels), partial(join_surveys, channels),
-                            self.scheduler, available_cores(None))
+                                 self.scheduler, available_cores(None))
         else:
             whole = next(self._sources())
             found = survey_part(whole, channels.read(whole))

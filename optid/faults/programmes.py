@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def solve_registered(name: str, *arguments: Any, solver: Any = "auto", settings: dict[str, Any] | None = None,
-           **structure: Any) -> Any:
+                     **structure: Any) -> Any:
     """Return the result of a fault formulation by its registered name."""
     from optid.solving.solve import run
 

@@ -70,7 +70,7 @@ class Likelihood:
         same, covariance = before is None or len(self.C) == 1, covariance_of(errors)  # the unit of one output cancels
         sign, value = np.linalg.slogdet(covariance)
         return OneStepPredictor(gain, radius, parts, starts if same else None, errors, covariance,
-                         float(value) if sign > 0 else -np.inf)
+                                float(value) if sign > 0 else -np.inf)
 
     def equations(self, found: OneStepPredictor) -> tuple[Array, Array]:
         """Return the normal equations of a step in the gain (row by row), states eliminated, errors whitened."""

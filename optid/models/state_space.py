@@ -29,7 +29,6 @@ MATRICES = {
 COVARIANCES = {"Q": "nn", "R": "ll", "S": "nl", "innovation": "ll"}
 
 
-
 @dataclass(frozen=True, eq=False, repr=False)
 class StateSpace(Model):
     """State equations with static functions of the inputs, of the outputs and of latent signals, in raw units.

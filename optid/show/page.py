@@ -65,7 +65,7 @@ def encode_chart(chart: Chart, most: int = MOST) -> dict[str, Any]:
     """Return a chart as JSON types for the script of the page, its curves of at most so many samples."""
     axes = {name: {key: value for key, value in asdict(axis).items()
                    if value is not None and value is not False and value != ""
-                    and (isinstance(value, str) or np.isfinite(value))}
+                   and (isinstance(value, str) or np.isfinite(value))}
             for name, axis in (("x", chart.x), ("y", chart.y))}
     cursor = all(one.kind in ("curve", "area", "bars") for one in chart.series)
     return {"title": chart.title, "caption": chart.caption, "group": chart.group, "equal": chart.equal,

@@ -35,6 +35,7 @@ RUNGS = {"instant": "instant proof", "ascent": "dual ascent", "sdp": "SDP", "pro
 THRESHOLD = 1e-8
 """Relative gap that counts as a proof."""
 
+
 @with_style
 def overview(fit: "Fit", test: Data | None = None) -> Figure:
     """Draw the result on one page: fit over time, characteristics, residual tests, poles, frequency response.

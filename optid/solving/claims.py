@@ -28,7 +28,7 @@ NOT_FINITE = "returned non-finite numbers"  # the reason of such a solution, aft
 
 
 def verdict(problem: Problem, back_end: BackEnd, answer: Answer, base: Solution, settings: Settings, prove: bool,
-             separate: bool) -> Solution:
+            separate: bool) -> Solution:
     """Return a solution with what an answer is worth, proved where that is asked for.
 
     Args:

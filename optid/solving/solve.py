@@ -158,7 +158,7 @@ class Outcome:
     # the last programme, with its solution, in which each user constraint stood: a procedure hands its constraints to
     # the steps they are about
     constrained: Mapping[str, tuple[Problem, Solution]] = field(default_factory=dict, repr=False)
-    # with which a procedure judged the whole: solution and program then do not belong together; the solution has
+    # with which a procedure judged the whole: solution and problem then do not belong together; the solution has
     # no bound where the evidence has a function that returns it
     evidence: Evidence | None = None
 

@@ -84,7 +84,7 @@ class Linearised:
 
 
 def linearise_errors(blocks: Callable[[int], Iterable[tuple[Array, int]]], experiments: int, n: int, p: int,
-               gauge: Array | None = None, method: Method = "auto") -> Linearised:
+                     gauge: Array | None = None, method: Method = "auto") -> Linearised:
     """Compress the errors of all experiments with their sensitivities by n initial states and p shared unknowns.
 
     ``blocks`` yields the rows [x0 | shared | errors] of an experiment by its number, and how many errors each block
@@ -104,12 +104,12 @@ def linearise_errors(blocks: Callable[[int], Iterable[tuple[Array, int]]], exper
 
 
 def compress_blocks(blocks: Iterable[tuple[Array, int]], columns: int, method: str, gauge: Array | None = None,
-               first: int = 0) -> tuple[Array, int]:
+                    first: int = 0) -> tuple[Array, int]:
     """Return a factor of the rows [x0 | shared | (measured) | errors] of an experiment, and the number of errors.
 
-    Columns of a state that is forgotten may be missing on the left. The gauge, as in `linearise_errors`,
-    takes part before
-    the factorisation by "gram" or "qr", which so is regular; column ``first`` is that of the first shared unknown.
+    Columns of a state that is forgotten may be missing on the left. The gauge, as in `linearise_errors`, takes part
+    before the factorisation by "gram" or "qr", which so is regular; column ``first`` is that of the first shared
+    unknown.
     """
     def add(block: Array) -> None:
         used = slice(columns - block.shape[1], None)

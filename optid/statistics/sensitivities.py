@@ -54,7 +54,7 @@ class TransferPredictor:
         `optid.statistics.linearised.linearise_errors`.
         """
         return linearise_errors(partial(self.blocks, point), self.unknowns.experiments, self.unknowns.memory,
-                          self.unknowns.shared, gauge, method)
+                                self.unknowns.shared, gauge, method)
 
     def instruments(self, point: TransferPoint) -> Array:
         """Return the Gram matrix (p + na + 1) of [sensitivities | -q^-i y_measured / A | errors], x0 eliminated.

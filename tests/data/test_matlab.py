@@ -79,7 +79,7 @@ def test_array_of_structures_is_one_experiment_per_element(save):
     data = read(save(run=[{"u": U[:9], "y": Y[:9], "t": T[:9]}, {"u": U[9:], "y": Y[9:], "t": T[9:] + 5}]))
     assert [e.start for e in data.experiments] == [0.0, pytest.approx(5.9)] and data.dt == 0.1
     batch = [{"run": [{"u": U, "y": Y}, {"u": Y, "y": U}], "Ts": 0.1}, {"run": [{"u": U, "y": U}, {"u": Y, "y": Y}],
-                                                                         "Ts": 0.1}]
+                                                                        "Ts": 0.1}]
     data = read(save(batch=batch))
     assert data.n_experiments == 4 and data.dt == 0.1
     np.testing.assert_array_equal(data.u[2][:, 0], U)

@@ -81,7 +81,6 @@ def test_dates_stand_beside_samples_and_survive_a_restart(folder, tmp_path):
     assert said == out
 
 
-
 def test_a_state_is_resumed_as_if_nothing_had_happened(folder, tmp_path):
     whole = known(folder)[0]
     rows = (folder / "stream.csv").read_text().splitlines(keepends=True)

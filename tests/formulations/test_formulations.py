@@ -50,7 +50,7 @@ def test_ratio_of_b_is_exact_for_a_function_that_is_not_odd():
 def test_several_inputs_each_with_its_own_basis_order_and_delay(form):
     bases = [Triangular(6), Polynomial(3), BSpline(4)]
     true = HammersteinTF([-1.1, 0.4], ([1.0, 0.5], [0.7], [0.3, -0.2, 0.4]),
-                          tuple(nonlinearity(basis, seed) for seed, basis in enumerate(bases)), (0, 2, 1), 0.2)
+                         tuple(nonlinearity(basis, seed) for seed, basis in enumerate(bases)), (0, 2, 1), 0.2)
     fit = optid.fit(noise_free(true, 500), form, na=2, nb=[2, 1, 3], nk=[0, 2, 1],
                     basis=[basis.with_interval(-0.7, 1.3) for basis in bases])
     assert distance(fit.model, true) < 1e-7

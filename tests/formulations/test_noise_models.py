@@ -92,7 +92,7 @@ def test_truth_without_noise(kind):
 
 @pytest.mark.parametrize("kind", ORDERS)
 @pytest.mark.parametrize("counts, seed, gaps, of_a, of_theta", [((6000, 9000), 3, 0.05, 0.02, 0.06),
-                                                                 ((40_000,), 4, 0.33, 0.008, 0.03)])
+                                                                ((40_000,), 4, 0.33, 0.008, 0.03)])
 def test_truth_with_noise_several_experiments_and_gaps(kind, counts, seed, gaps, of_a, of_theta):
     model = system(kind)
     pose, orders = ORDERS[kind]

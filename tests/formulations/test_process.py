@@ -560,7 +560,6 @@ def test_parameters_at_their_bounds_are_named():
     assert two == "" and one == "tau2 at the smallest value that is tried, 0.05 s: fewer poles may do"
 
 
-
 def test_the_command_prints_gain_time_constant_dead_time_and_proof(tmp_path):
     from typer.testing import CliRunner
 

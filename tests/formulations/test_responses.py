@@ -19,7 +19,6 @@ from optid.solving.solve import solve
 INPUTS, OUTPUTS, N = ("u1", "u2"), ("y1", "y2"), 3
 
 
-
 def system(seed=0, direct=True, functions=None):
     """A problem that fits random targets Theta, with A and C held."""
     rng = np.random.default_rng(seed)

@@ -209,7 +209,7 @@ def test_scales_of_the_states_do_not_matter():
 def test_regions_that_exclude_each_other_are_named():
     rng = np.random.default_rng(0)
     step = constrained_shift(*observability(unstable(3, rng), 2, 10, rng), [disc(0.0, 0.3), stable(0.99),
-                                                                          strip(0.5, 0.9)])
+                                                                            strip(0.5, 0.9)])
 
     def procedure():
         shift = yield from step

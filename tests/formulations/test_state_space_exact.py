@@ -61,7 +61,7 @@ def weighted_square(criterion, x):
 def latent_functions():
     smooth, cells = Polynomial(4).with_interval(-2, 2), BSpline(5, interval=(-1.0, 1.0), outside="extrapolate")
     return (Latent(smooth, beyond_affine(smooth), direct=True), Latent(cells, np.eye(cells.size), feeds=False, output=1,
-                                                                 moved=False))
+                                                                       moved=False))
 
 
 RUNS = {"simulation": "simulate", "measured feedback": "simulate_measured_feedback", "prediction": "predict"}

@@ -43,7 +43,7 @@ def record(rng: np.random.Generator) -> tuple[object, object]:
     found = []
     for x in (u, y):
         what = rng.choice(["plain"] * 24 + ["gaps", "inf", "constant", "huge", "tiny", "float32", "int8", "object",
-                                           "text", "complex", "flat", "transposed", "shorter", "list", "bool"])
+                                            "text", "complex", "flat", "transposed", "shorter", "list", "bool"])
         if what == "gaps":
             x = np.where(rng.random(x.shape) < 0.2, np.nan, x)
         elif what == "inf":

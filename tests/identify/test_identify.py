@@ -207,8 +207,8 @@ def test_a_trial_is_given_up_early_and_says_why():
     data = plant(400, cubic=0.5)
     blocks = Blocks.of(data)
     good = run_trial(StructureCandidate(INPUTS, "hammerstein_oe.exact",
-                                    {"na": 1, "nb": 1, "nk": [1], "basis": "polynomial:3"}),
-                 blocks, None, {}, (), None)
+                                        {"na": 1, "nb": 1, "nk": [1], "basis": "polynomial:3"}),
+                     blocks, None, {}, (), None)
     assert good.complete and good.score > 95 and len(good.by_block) == 4 and good.parameters == 5
     poor = run_trial(StructureCandidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, good, {}, (), None)
     assert not poor.complete and "below the cross-validated fit of the best" in poor.reason and poor.score == -np.inf

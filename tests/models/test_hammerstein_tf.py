@@ -22,7 +22,7 @@ C, D = np.array([-0.6, 0.25]), np.array([-0.5, 0.1, 0.3])
 
 def two_inputs():
     return HammersteinTF([-1.2, 0.5], ([1.0, 0.4], [0.3, -0.2, 0.1]),
-                          (nonlinearity(Triangular(5), 1), nonlinearity(Polynomial(3), 2)), (0, 2), 0.4, dt=0.1)
+                         (nonlinearity(Triangular(5), 1), nonlinearity(Polynomial(3), 2)), (0, 2), 0.4, dt=0.1)
 
 
 def models():

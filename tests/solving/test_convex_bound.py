@@ -31,7 +31,7 @@ CONVEX = {
 def posed(name, data=None, constrained=True):
     word, arguments, constraints = CONVEX[name]
     return for_solvers(formulation(word)[1](record() if data is None else data,
-                                             constraints=constraints if constrained else (), **arguments))
+                                            constraints=constraints if constrained else (), **arguments))
 
 
 def careless(share, inner="clarabel", duals=True):

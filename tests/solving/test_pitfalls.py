@@ -183,7 +183,7 @@ def fit(gauge: str, **constraint) -> Problem:
     program = pose(f"fit {gauge}", cp.sum_squares(residual), {"gauge": gauges[gauge]}, [a, mu, b],
                    start={"a": np.zeros(1), "mu": np.array([-1.0, 0, 0, 1.0]), "b": np.array([1.0, 0.5])})
     return program.subject_to(*(lambda v, name=name, build=build: {name: build(v["mu"])}
-                                     for name, build in constraint.items()))
+                                for name, build in constraint.items()))
 
 
 def test_8_a_bound_on_mu_means_something_only_under_its_normalisation():

@@ -25,8 +25,8 @@ def case(seed=0, constant=True):
     unknowns = TransferUnknowns(layout, 2, (True, False), constant)
     poles = [0.8, 0.5 + 0.3j, 0.5 - 0.3j]
     point = TransferPoint(np.real(np.poly(poles))[1:], (rng.normal(size=4), np.ones(1)),
-                       (rng.normal(size=2), rng.normal(size=3)), 0.3 if constant else 0.0,
-                       rng.normal(size=(2, unknowns.memory)))
+                          (rng.normal(size=2), rng.normal(size=3)), 0.3 if constant else 0.0,
+                          rng.normal(size=(2, unknowns.memory)))
     return data, unknowns, point
 
 
@@ -64,7 +64,7 @@ def test_simulation_equals_that_of_the_model(chunk, monkeypatch):
     data, unknowns, point = case()
     layout = unknowns.layout
     model = HammersteinTF(point.a, point.bs, tuple(Nonlinearity(b, mu) for b, mu in zip(layout.bases, point.mus)),
-                           layout.nk, point.offset)
+                          layout.nk, point.offset)
     found = TransferPredictor(data, unknowns).simulate(point)
     for ours, theirs in zip(found, model.simulate(data, x0=list(point.x0))):
         assert np.max(np.abs(ours - theirs[:, 0])) < 1e-12

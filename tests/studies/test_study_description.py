@@ -487,7 +487,6 @@ def test_labels_and_title_do_not_change_the_key():
 
 def test_versions_change_the_key(monkeypatch):
 
-
     study = Study.from_text(SMALL)
     before = {cell.key for cell in grid.cells(study)}
     grid.determining.cache_clear()
@@ -500,7 +499,6 @@ def test_versions_change_the_key(monkeypatch):
 
 def test_versions_do_not_depend_on_how_optid_was_installed(monkeypatch):
     """In place it is no distribution that holds the package; as a wheel it is."""
-
 
     found = []
     for holders in ((), ("optid",)):

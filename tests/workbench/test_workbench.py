@@ -38,7 +38,7 @@ def source(name="thruster", **options):
     chosen = example(name, **options)
     words = "".join(f", {key}={value!r}" for key, value in options.items())
     return BenchSource(chosen.data, f"optid.examples.example({name!r}{words}).data",
-                  suggest_state(chosen.data, chosen.suggestion))
+                       suggest_state(chosen.data, chosen.suggestion))
 
 
 @contextmanager

@@ -229,7 +229,7 @@ def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], w
     dated = tuple(name for name, column in columns.items() if (one := _first(column, how)) and dates.is_date(one))
     _propose(columns, dated, how, needed)
     return TextLayout(names, how, rows[len(texts)].end, {name: unit.strip() for name, unit in units.items()},
-                  len(texts), dated, hints=clock_hints(columns), findings=tuple(findings))
+                      len(texts), dated, hints=clock_hints(columns), findings=tuple(findings))
 
 
 def _refuse_preamble(rows: list[_Row], width: int, where: str, needed: dict[str, Any]) -> None:

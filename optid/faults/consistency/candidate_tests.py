@@ -29,7 +29,7 @@ Pose = Callable[[BoundedWindow, Signature | None], Problem]
 
 
 def judge_candidates(window: BoundedWindow, pose: Pose, faults: Dictionary | None, onsets: Sequence[int] | str,
-                    candidates: bool, constraints: Sequence[Any]) -> Procedure:
+                     candidates: bool, constraints: Sequence[Any]) -> Procedure:
     """Find the factor of a healthy plant, and whether every candidate is possible.
 
     Arguments, result and errors are those of `formulations.faults.membership.membership`.

@@ -89,6 +89,10 @@ class Decisions:
         """Return the candidates of the group of one."""
         return [c for c, first in enumerate(self.groups) if first == self.groups[number]]
 
+    def _family(self, number: int, window: Window) -> list[int]:
+        """Return those of the group of one that have any constant and an onset."""
+        return [c for c in self.group(number) if self.columns.candidates[c].has_constants and window.peak[c]]
+
     @property
     def thresholds(self) -> Array:
         """(C,) thresholds at this sample."""
@@ -248,7 +252,7 @@ class Decisions:
         labels = [label for label, _ in said]
         if labels != [label for label in self.told if label in weights]:
             event = self._told("revised", now, said, chosen, window)
-        family = [c for c in self.group(chosen) if self.columns.candidates[c].has_constants and window.peak[c]]
+        family = self._family(chosen, window)
         if family and (len(labels) > 1 or not self.columns.candidates[chosen].additive):
             chosen = family[0]
             self.undecided = [one for one in self.undecided if one[0] != chosen] + [[chosen, labels]]
@@ -273,8 +277,7 @@ class Decisions:
     def _kinds(self, number: int, window: Window) -> dict[str, float]:
         """Return {label: likelihood} of the group of a candidate."""
         logs: dict[str, float] = {}
-        here = self.group(number)
-        family = [c for c in here if self.columns.candidates[c].has_constants and window.peak[c]]
+        here, family = self.group(number), self._family(number, window)
         for c in here:
             if window.peak[c] and (c in family or not (family and self.columns.candidates[c].additive)):
                 sizes, covariance, _ = window.estimate(c)
@@ -300,11 +303,15 @@ class Decisions:
         window.restart()
         self.phase, self.named, self.quiet = WATCHING, NOTHING, 0
 
+    def _give_up(self, window: Window) -> None:
+        """Go on with an alarm that no candidate explains alone."""
+        self.phase, self.named, self.quiet, self.told = LOST, NOTHING, 0, []
+        window.restart()
+
     def _lost(self, now: int, best: int, window: Window, noise: Event | None) -> Event:
         """Return more noise of a sensor, or that no candidate explains the alarm."""
         onset, energy = now - int(window.peak[best]) + 1, float(window.statistic[best])
-        self.phase, self.named, self.quiet, self.told = LOST, NOTHING, 0, []
-        window.restart()
+        self._give_up(window)
         if noise is not None and noise.statistic > self.thresholds.max():
             return noise
         return Event("isolated", now, ((UNKNOWN, 1.0),), onset, (), energy, "no candidate explains it")
@@ -331,8 +338,7 @@ class Decisions:
             return event
         for number in young:
             self._release(number, window, plant)
-        self.phase, self.named, self.quiet, self.told = LOST, NOTHING, 0, []
-        window.restart()
+        self._give_up(window)
         return self._by_several(replace(event, candidates=((UNKNOWN, 1.0),)), found)
 
     def _by_several(self, other: Event, found: tuple[FaultAnswer, ...] | None) -> Event | None:
@@ -378,8 +384,7 @@ class Decisions:
               ) -> Event:
         """Return an event with onset and size of its first label; one of no candidate is in the group of the best."""
         same = [c for c, label in enumerate(self.labels) if label == said[0][0] and window.peak[c]]
-        here = self.group(same[0] if same else best)
-        family = [c for c in here if self.columns.candidates[c].has_constants and window.peak[c]]
+        family = self._family(same[0] if same else best, window)
         is_offset = bool(same) and self.columns.candidates[same[0]].additive
         number = family[0] if family and not is_offset else (same or [best])[0]
         sizes, _, _ = window.estimate(number)

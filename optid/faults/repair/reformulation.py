@@ -107,7 +107,6 @@ class Reformulation(Rendered):
         return self.allocation.attainable(reference)
 
 
-
 def reformulate(
     model: "HammersteinSS", diagnosis: "Diagnosis", data: Any = None, *,
     constraints: Sequence[Any] | str = "default", prior: RefitPrior | None = None, nodes: int = NODES,

@@ -220,7 +220,7 @@ def _step(criterion: Criterion, x: Array, hold_c: bool) -> tuple[Array, float]:
     rest, step = np.setdiff1d(np.arange(x.size), held), np.zeros(x.size)
     # without weight on what changes no output, which may be needed here
     matrix, errors = linearise_errors(criterion.rows(x), unknowns.experiments, unknowns.memory, unknowns.shared,
-                                method="qr").whole
+                                      method="qr").whole
     sizes = np.maximum(np.linalg.norm(matrix[:, rest], axis=0), 1e-300)
     step[rest] = -np.linalg.lstsq(matrix[:, rest] / sizes, errors, rcond=1e-12)[0] / sizes
     left = matrix @ step + errors

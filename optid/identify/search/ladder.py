@@ -265,10 +265,10 @@ def _in_a_loop(ladder: Ladder) -> Rung:
     if ladder.single:
         delay = list(ladder.delays[-1])
         yield from climb([model("bj.exact", na=n, nb=n, nk=delay, nc=1, nd=1),
-                            model("armax.exact", na=n, nb=n, nk=delay, nc=n)] for n in range(1, 5))
+                          model("armax.exact", na=n, nb=n, nk=delay, nc=n)] for n in range(1, 5))
     else:
         yield from climb([model("ss.exact", nx=n, criterion="prediction", feedthrough=False)]
-                           for n in range(1, LARGEST + 1))
+                         for n in range(1, LARGEST + 1))
 
 
 def input_functions(ladder: Ladder) -> Rung:
@@ -337,7 +337,7 @@ def feedback(ladder: Ladder) -> Rung:
     a = ladder.arguments(FEEDBACK)
     if ladder.promising(FEEDBACK):
         yield from climb([model(nx=n, basis=a["basis"], feedback_basis=a["feedback_basis"])]
-                           for n in range(a["nx"] + 1, 7))
+                         for n in range(a["nx"] + 1, 7))
 
 
 def _inner(ladder: Ladder) -> list[Any]:

@@ -166,7 +166,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     kept = KeptTrials(trials, data, {"blocks": blocks, "horizon": horizon, "constraints": [
         getattr(rule, "name", rule) for rule in rules], "solver": solver, "accuracy": accuracy})
     pool = TrialPool(partial(_attempt, cut, {"solver": solver, "accuracy": accuracy}, rules, horizon),
-                available_cores(workers, "workers"))
+                     available_cores(workers, "workers"))
     alone = pool.reason and (_unsendable(rules, solver) or pool.reason)
     if alone and workers is not None:
         raise StructureError(f"workers={workers!r}: {alone}, or use workers=1")

@@ -144,7 +144,7 @@ class Trial:
 
 
 def run_trial(candidate: StructureCandidate, blocks: Blocks, rival: Trial | None, settings: Mapping[str, Any],
-          constraints: Sequence[Any], horizon: int | None, seconds: float = np.inf) -> Trial:
+              constraints: Sequence[Any], horizon: int | None, seconds: float = np.inf) -> Trial:
     """Fit a candidate, cross-validate it block by block, and stop early where it cannot beat its rival.
 
     The settings are solver and accuracy, the horizon is as in `Blocks.errors`. After so many CPU seconds the trial is

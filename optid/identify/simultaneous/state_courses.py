@@ -54,7 +54,7 @@ class StateCourses(Courses):
         errors = self.criterion
         runs = errors.run_states(errors.unknowns.unpack(self.x))
         return self.complete({**errors.variables.values(self.x),
-                               **dict(zip([f"states{label}" for label in errors.labels], runs))})
+                              **dict(zip([f"states{label}" for label in errors.labels], runs))})
 
     def limits(self, start: Values) -> dict[str, tuple[Array, Array]]:
         """Return ten times the largest value of every column."""

@@ -176,7 +176,7 @@ def _false_claims(table: Table, found: Results) -> tuple[FalseClaim, ...]:
         winner = found.solvers[int(np.flatnonzero(found.solved[p])[0])]
         lies.append((int(found.row[p, s]), f"{winner} has a verified point"))
     groups = group_words(((table["solver"][i], table["formulation"][i], table["status_claimed"][i]), reason)
-                     for i, reason in lies)
+                         for i, reason in lies)
     claims = [FalseClaim(key[0], key[1], len(reasons), key[2], min(reasons)) for key, reasons in groups.items()]
     return tuple(sorted(claims, key=lambda c: (-c.count, c.solver, c.formulation, c.claimed)))
 

@@ -64,4 +64,4 @@ def line(data: Data) -> Basis:
 def recover(data: Data, values: Mapping[str, np.ndarray]) -> HammersteinTF:
     """Return the model: A = 1, B the impulse response."""
     return HammersteinTF(np.zeros(0), (values["b"],), (Nonlinearity(line(data), np.ones(1)),), (0,), values["offset"],
-                          data.dt, data.inputs, data.outputs, data.input_units, data.output_units)
+                         data.dt, data.inputs, data.outputs, data.input_units, data.output_units)
