@@ -113,8 +113,8 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
                     origin = sound = _identified_from(model)
                 found = dictionary(
                     plant, kinds=words.split_names(kinds) or list(KINDS_BY_DEFAULT), state_jump=state_jump,
-                    process=words.directions(load, "--process",
-                                             plant), disturbances=words.split_names(disturbance) or (),
+                    process=words.directions(load, "--process", plant),
+                    disturbances=words.split_names(disturbance) or (),
                     zeros=words.pairs(words.split_names(zero), "--zero", ZERO, float))
                 watcher = _new(found, thresholds, arl0=arl0, window=window, seed=seed, healthy=sound,
                                uncertainty=origin, extrapolate=extrapolate, adapt=adapt,

@@ -184,8 +184,8 @@ class ModelUncertainty:
             columns.append(diffuse(self.predictor.respond(*unknown_effects(self.model, part.u), present)))
             unknown = int(np.linalg.matrix_rank(self.predictor.whitened_columns(columns[-1], present)))
         changes = np.concatenate(columns, axis=2)
-        flat = self.predictor.whitened_columns(changes,
-                                               present) if seen is None else seen(changes).reshape(present.size, -1)
+        white = self.predictor.whiten(changes, present) if seen is None else seen(changes)
+        flat = white.reshape(present.size, -1)
         U, s, _ = np.linalg.svd(flat, full_matrices=False)
         return Nuisance(U, s, unknown)
 

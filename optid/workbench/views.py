@@ -86,11 +86,10 @@ def delay_view(record: Data) -> dict[str, Any]:
 
 def verdict_view(fit: Any) -> dict[str, Any]:
     """Return the verdict on a fit and its residual tests."""
-    found = fit.verdict
+    found, checked = fit.verdict, charts.validate_quietly(fit.model, fit.data.raw())
     return {"word": found.word, "tone": TONES[found.word], "sentence": summary.judgement(found),
             "parts": [[part.name, part.value, part.outcome] for part in found.parts],
-            "charts": [encode_chart(one) for one in charts.correlation_charts(charts.validate_quietly(fit.model,
-                                                                                                      fit.data.raw()))]}
+            "charts": [encode_chart(one) for one in charts.correlation_charts(checked)]}
 
 
 def _finite(value: float) -> float | None:

@@ -158,9 +158,9 @@ def _rows(lines: Sequence[str], first: int, start: int, how: Format, where: str)
                 yield line
 
     blanks = how.delimiter == BLANKS
+    named = read_named()
     try:
-        for cells in (map(str.split, read_named()) if blanks else csv.reader(read_named(),
-                                                                             delimiter=how.delimiter or ",")):
+        for cells in map(str.split, named) if blanks else csv.reader(named, delimiter=how.delimiter or ","):
             if any(cells) or len(rows) > MOST_TEXT_ROWS or any(any(map(_is_value, row.cells)) for row in rows):
                 rows.append(_Row(cells, *taken))
             elif rows:  # a blank line after the header

@@ -114,8 +114,8 @@ class Monitor:
         effect, inputs, known, remarks = None, None, uncertainty, []
         if known is not None:
             silent = found.predictor if found.predictor.silent else None
-            known = known if isinstance(known, ModelUncertainty) else model_uncertainty(found.model, known,
-                                                                                        decoupled=silent)
+            if not isinstance(known, ModelUncertainty):
+                known = model_uncertainty(found.model, known, decoupled=silent)
             found = replace(found, predictor=known.predictor)
             remarks.append(known.remark)
         sized = uncertain_start(found.model, found.predictor) if known is None else known
@@ -371,10 +371,10 @@ class Monitor:
         """Return {number of the candidate: the fault} of the carried faults that the last samples show."""
         if self.recent is None:
             return {}
-        labels = {self.decisions.label_of(number): number for number, _ in self.decisions.onsets}
-        onsets = {self.decisions.label_of(number): onset for number, onset in self.decisions.onsets}
+        numbered = {self.decisions.label_of(number): (number, onset) for number, onset in self.decisions.onsets}
+        onsets = {label: onset for label, (_, onset) in numbered.items()}
         found = self.recent.estimate(onsets, self.dictionary.candidates, self.samples)
-        return {labels[label]: one for label, one in found.items()}
+        return {numbered[label][0]: one for label, one in found.items()}
 
     # -- operators -------------------------------------------------------------------------------------------------
 

@@ -88,7 +88,11 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Problem], structure:
     whole = compress(data, structure)
     record = data if whole.shifts is None else remove_levels(data)[0]
     used = _Rows(in_units(record, whole.units), whole.layout)
-    problem, base = whole, for_solvers(replace(pose(whole), step=True))
+
+    def step(problem: EquationError) -> Problem:
+        return for_solvers(replace(pose(problem), step=True))
+
+    problem, base = whole, step(whole)
     scale = base.scale  # the weights of a pass are no unit of the data
 
     def weighted_program(sizes: list[np.ndarray], start: Values) -> tuple[Problem, list[np.ndarray]]:
@@ -101,7 +105,7 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Problem], structure:
     while True:
         if used.count:
             problem = compress(data, structure, weights=used.only(np.ones(e.n_samples) for e in data.experiments))
-            base = for_solvers(replace(pose(problem), step=True))
+            base = step(problem)
             scale = base.scale
         program, weights, spread, width = base, [], 0.0, 0.0
         for _ in range(SETTLING):  # the scale settles before the loss is fixed; afterwards the objective cannot rise
