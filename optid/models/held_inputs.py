@@ -12,7 +12,6 @@ from scipy.linalg import expm, logm, matrix_balance
 
 from optid.arrays import Array
 from optid.errors import StructureError
-from optid.models.process_kernel import run, thin_out
 
 SAME = 1e-9  # share of the shortest sampling interval within which two instants are one
 AMBIGUOUS = 1e-6  # angle from the negative real axis, in radians, within which a logarithm has no certain branch
@@ -92,6 +91,8 @@ def run_held(system: tuple[Array, Array, Array, Array], delays: Array, instants:
     A drive takes its samples later by its entry of delays (r,), and has its value `before` (r,) until then; x0 (n,) is
     the state at the first instant.
     """
+    from optid.models.process_kernel import run, thin_out  # numba
+
     A, B, C, D = system
     block, scale = _balanced(A, B)
     n, y = len(A), np.zeros((len(instants), len(C)))
