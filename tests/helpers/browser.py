@@ -86,6 +86,7 @@ class Browser:
             self.session = self.send("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
             for domain in ("Page", "Runtime", "Network", "Log"):
                 self.send(f"{domain}.enable")
+            self.send("Performance.enable", timeDomain="threadTicks")
         except BaseException:
             self.__exit__()
             raise
@@ -164,6 +165,11 @@ class Browser:
             if "context" in str(error):  # the page that was asked has just been replaced by the one that comes
                 return False
             raise
+
+    def busy(self) -> float:
+        """Return the seconds of processor time that the thread of the page has spent on it, other processes or not."""
+        found = self.send("Performance.getMetrics")["metrics"]
+        return next(one["value"] for one in found if one["name"] == "TaskDuration")
 
     def open(self, path: Path, ready: str = "document.documentElement?.dataset.ready") -> float:
         """Open a file, wait until it is ready, and return the seconds from the command on."""
