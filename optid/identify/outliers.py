@@ -16,8 +16,8 @@ from optid.arrays import Array
 LONGEST = 3  # outliers in a row that still count as isolated
 WINDOW = 15  # samples of the running median
 SHORT = 10_000  # samples up to which sorting every window takes less time than the import of scipy.ndimage
-SAMPLED, GOLDEN = 2000, 0.6180339887  # samples from which the scale is first estimated, and the spacing of them
-CAREFUL = 0.9  # share of this estimate that the scale of the whole record is not below
+SAMPLED, GOLDEN = (100, 2000), 0.6180339887  # fewest and most from which the scale is first estimated, and their spacing
+CAREFUL = 4.5  # over the root of their number: the share of this estimate that the scale may be below it
 MOST = 0.12  # largest share of outliers that is considered
 LEAST_SAMPLES = 50  # samples of a channel below which there is no test
 FAR = 6.0  # smallest deviation of an outlier, in robust standard deviations
@@ -83,27 +83,28 @@ def _additive(r: Array, signature: Array, critical: float) -> np.ndarray:
 
 
 def _may_hold(parts: Sequence[Array]) -> bool:
-    """Whether a long record may have outliers, by its jumps and a sample of its deviations: 8 times as fast.
+    """Whether a record may have outliers, by its jumps and every eighth of its deviations: 8 times as fast.
 
     An outlier is `FAR` robust standard deviations off the running median, and over `FAR` / `STEP` off a neighbour.
     """
-    if min(x.size for x in parts) <= SHORT:
-        return True
     half = WINDOW // 2
+    count = min(min(x.size for x in parts) // 8, SAMPLED[1])
+    if count < SAMPLED[0]:
+        return True
 
     def deviations(x: Array, at: np.ndarray) -> Array:
         windows = np.lib.stride_tricks.sliding_window_view(x, WINDOW)
         return np.abs(x[at] - np.partition(windows[at - half], half, axis=1)[:, half])
 
-    spread = (np.arange(SAMPLED) * GOLDEN) % 1  # even, and in step with no period of the record
+    spread = (np.arange(count) * GOLDEN) % 1  # even, and in step with no period of the record
     some = [deviations(x, half + ((x.size - 2 * half) * spread).astype(int)) for x in parts]
-    least = CAREFUL * FAR * float(np.median(np.concatenate(some))) / NORMAL_MEDIAN
+    least = (1 - CAREFUL / np.sqrt(count * len(parts))) * FAR * float(np.median(np.concatenate(some))) / NORMAL_MEDIAN
     for x in parts:
         jumps = np.flatnonzero(np.abs(np.diff(x)) > least / STEP)
         edge = jumps[(jumps < half) | (jumps >= x.size - half - LONGEST)]
         runs = jumps[:-1][np.diff(jumps) <= LONGEST]  # there and back
         near = runs[:, None] + np.arange(1, 1 + LONGEST)
-        if edge.size or near.size > SHORT or near.size and np.max(deviations(x, near.ravel())) > least:
+        if edge.size or near.size > min(SHORT, x.size // 2) or near.size and np.max(deviations(x, near.ravel())) > least:
             return True
     return False
 
