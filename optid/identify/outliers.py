@@ -16,7 +16,7 @@ from optid.arrays import Array
 LONGEST = 3  # outliers in a row that still count as isolated
 WINDOW = 15  # samples of the running median
 SHORT = 10_000  # samples up to which sorting every window takes less time than the import of scipy.ndimage
-SAMPLED, GOLDEN = (100, 2000), 0.6180339887  # fewest and most from which the scale is first estimated, and their spacing
+SAMPLED, GOLDEN = (100, 2000), 0.6180339887  # fewest and most for a first estimate of the scale, and their spacing
 CAREFUL = 4.5  # over the root of their number: the share of this estimate that the scale may be below it
 MOST = 0.12  # largest share of outliers that is considered
 LEAST_SAMPLES = 50  # samples of a channel below which there is no test
@@ -104,7 +104,8 @@ def _may_hold(parts: Sequence[Array]) -> bool:
         edge = jumps[(jumps < half) | (jumps >= x.size - half - LONGEST)]
         runs = jumps[:-1][np.diff(jumps) <= LONGEST]  # there and back
         near = runs[:, None] + np.arange(1, 1 + LONGEST)
-        if edge.size or near.size > min(SHORT, x.size // 2) or near.size and np.max(deviations(x, near.ravel())) > least:
+        many = near.size > min(SHORT, x.size // 2)
+        if edge.size or many or near.size and np.max(deviations(x, near.ravel())) > least:
             return True
     return False
 

@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 import optid
 from optid import examples
 from optid.errors import DataWarning
+from optid.identify import outliers
 from optid.identify.outliers import find_additive_outliers, find_outliers
 
 
@@ -145,6 +146,21 @@ def test_experiments_are_examined_together():
 def test_short_empty_and_constant_channels_have_none():
     for x in (np.zeros(0), np.full(30, np.nan), np.r_[np.zeros(30), 9.0], np.full(500, 0.1), np.r_[np.ones(499), 9.0]):
         assert not find_outliers([x])[0].size
+
+
+@pytest.mark.parametrize("name", [*SIGNALS, *OTHERS])
+def test_what_a_sample_of_the_deviations_clears_has_no_outliers(name, monkeypatch):
+    records = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        x = {**SIGNALS, **OTHERS}[name](rng, [800, 2000, 12_000, 40_000][seed % 4])
+        for place in rng.integers(0, x.size - 3, seed // 4):
+            x[place : place + rng.integers(1, 4)] += rng.choice([-1, 1]) * rng.uniform(2, 20) * x.std()
+        records.append(x)
+    quick = [find_outliers([x])[0] for x in records]
+    monkeypatch.setattr(outliers, "_may_hold", lambda parts: True)
+    for x, found in zip(records, quick):
+        assert np.array_equal(find_outliers([x])[0], found)
 
 
 def test_a_million_samples_take_less_than_a_second():
