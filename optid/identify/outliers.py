@@ -97,8 +97,9 @@ def _may_hold(parts: Sequence[Array]) -> bool:
         return np.abs(x[at] - np.partition(windows[at - half], half, axis=1)[:, half])
 
     spread = (np.arange(count) * GOLDEN) % 1  # even, and in step with no period of the record
-    some = [deviations(x, half + ((x.size - 2 * half) * spread).astype(int)) for x in parts]
-    least = (1 - CAREFUL / np.sqrt(count * len(parts))) * FAR * float(np.median(np.concatenate(some))) / NORMAL_MEDIAN
+    some = np.concatenate([deviations(x, half + ((x.size - 2 * half) * spread).astype(int)) for x in parts])
+    middle = float(np.partition(some, some.size // 2)[some.size // 2])
+    least = (1 - CAREFUL / np.sqrt(some.size)) * FAR * middle / NORMAL_MEDIAN
     for x in parts:
         jumps = np.flatnonzero(np.abs(np.diff(x)) > least / STEP)
         edge = jumps[(jumps < half) | (jumps >= x.size - half - LONGEST)]

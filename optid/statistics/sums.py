@@ -166,12 +166,12 @@ class Sums(Total):
             lags_g, lags_h = self.frame.lags[g], self.frame.lags[h]
             if g == h:  # the product at -d is the transpose of that at d
                 sums = np.concatenate([sums[:, :0:-1].transpose(2, 1, 0), sums], axis=1)
-            others = at[h].ravel()
-            for start, columns in zip(range(lags_g[-1] - lags_g[0], -1, -1), at[g]):
-                part = sums[:, start : start + len(lags_h)].reshape(columns.size, -1)
-                gram[columns[0] : columns[-1] + 1, others] += part
-                if g != h:  # outputs at lag 0 stand behind the inputs
-                    gram[others, columns[0] : columns[-1] + 1] += part.T
+            own, others = at[g].ravel(), at[h].ravel()
+            latest = np.lib.stride_tricks.sliding_window_view(sums, len(lags_h), axis=1)[:, len(lags_g) - 1 :: -1]
+            part = latest.transpose(1, 0, 3, 2).reshape(own.size, others.size)
+            gram[np.ix_(own, others)] += part
+            if g != h:  # outputs at lag 0 stand behind the inputs
+                gram[np.ix_(others, own)] += part.T
         for columns, total in zip(at, self._totals):
             gram[columns, constant] += total
             gram[constant, columns] += total
