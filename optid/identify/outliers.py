@@ -102,11 +102,14 @@ def _may_hold(parts: Sequence[Array]) -> bool:
     least = (1 - CAREFUL / np.sqrt(some.size)) * FAR * middle / NORMAL_MEDIAN
     for x in parts:
         jumps = np.flatnonzero(np.abs(np.diff(x)) > least / STEP)
-        edge = jumps[(jumps < half) | (jumps >= x.size - half - LONGEST)]
+        edges = (jumps < half) | (jumps >= x.size - half - LONGEST)
         runs = jumps[:-1][np.diff(jumps) <= LONGEST]  # there and back
         near = runs[:, None] + np.arange(1, 1 + LONGEST)
-        many = near.size > min(SHORT, x.size // 2)
-        if edge.size or many or near.size and np.max(deviations(x, near.ravel())) > least:
+        near = near[(near >= half) & (near < x.size - half)]
+        if near.size > min(SHORT, x.size // 2) or near.size and np.max(deviations(x, near)) > least:
+            return True
+        ends = (x[: 3 * WINDOW], x[: -3 * WINDOW - 1 : -1]) if edges.any() else ()
+        if any(np.max(_deviations(end)[: half + LONGEST]) > least for end in ends):
             return True
     return False
 
