@@ -172,7 +172,7 @@ def finite(values: Any, name: str, largest: float = LARGEST) -> np.ndarray:
         array = np.array(values, dtype=float)
     except (OverflowError, TypeError, ValueError) as error:
         raise StructureError(f"{name} must be an array of real numbers ({error}).") from error
-    if not (np.abs(array) <= largest).all():
+    if array.size and not np.abs(array).max() <= largest:
         if not np.isfinite(array).all():
             at = ",".join(str(i) for i in np.argwhere(~np.isfinite(array))[0])
             raise StructureError(f"{name} contains a value that is not finite, {name}[{at}].")

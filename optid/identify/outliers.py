@@ -87,14 +87,13 @@ def _may_hold(parts: Sequence[Array]) -> bool:
 
     An outlier is `FAR` robust standard deviations off the running median, and over `FAR` / `STEP` off a neighbour.
     """
-    half = WINDOW // 2
+    half, around = WINDOW // 2, np.arange(WINDOW) - WINDOW // 2
     count = min(min(x.size for x in parts) // 8, SAMPLED[1])
     if count < SAMPLED[0]:
         return True
 
     def deviations(x: Array, at: np.ndarray) -> Array:
-        windows = np.lib.stride_tricks.sliding_window_view(x, WINDOW)
-        return np.abs(x[at] - np.partition(windows[at - half], half, axis=1)[:, half])
+        return np.abs(x[at] - np.partition(x[at[:, None] + around], half, axis=1)[:, half])
 
     spread = (np.arange(count) * GOLDEN) % 1  # even, and in step with no period of the record
     some = np.concatenate([deviations(x, half + ((x.size - 2 * half) * spread).astype(int)) for x in parts])
