@@ -3,8 +3,9 @@
     python harness.py LIMIT ENTRY.py KIND RECORD.npz [RECORD.npz ...]
 
 One line of JSON on the standard output before each record (``{"record": ...}``) and after it; whatever the package
-prints goes to the standard error. The time is CPU time of this process and its children in the entry's function alone;
-the first fit of a process is done twice and the second counts, unless it takes more than `WARM` seconds.
+prints goes to the standard error. The time is CPU time of this process and its children in the entry's function alone,
+and beside it that of what the entry puts off ("later"); the first fit of a process is done twice and the second counts,
+unless it takes more than `WARM` seconds.
 A fit that takes more than LIMIT CPU seconds ends the process (SIGXCPU).
 """
 
@@ -60,9 +61,12 @@ def measured(fitter: judging.Fitter, path: str) -> dict:
             started = cpu_seconds()
             model = fitter(given)
             seconds = cpu_seconds() - started
+            started = cpu_seconds()
+            model.get("later", dict)()
+            later = cpu_seconds() - started if "later" in model else 0.0
             u, y = record["test_u"], record["test_y"]
             found = {"seconds": seconds, "values": np.ravel(model["values"]).tolist()} if "values" in model else {
-                "seconds": seconds, "one_step": judging.fit_percent(y, judging.one_step(model, u, y)),
+                "seconds": seconds, "later": later, "one_step": judging.fit_percent(y, judging.one_step(model, u, y)),
                      "simulation": judging.fit_percent(y, judging.simulate(model, u, y))}
             if "nodes" in record:
                 found["disobeyed"] = judging.disobeyed(model, record["nodes"])

@@ -89,6 +89,8 @@ def rows_text(row: Row, lines: list[Line]) -> list[str]:
         against = "-" if one.peer in OURS or not ours else " / ".join(
             f"{difference(ours[0], one, figure):+.3f}" for figure in ("one_step", "simulation"))
         remark = f" {cell(one.reason)}" if one.reason else ""
+        if any(result.get("later") for result in one.scores.values()):
+            remark += f", {one.seconds + one.mean('later'):.3g} with the gain of its noise"
         text.append(f"| {label(one.peer)} | {one.lines} | {one.seconds:.3g}{remark} | {one.mean('one_step'):.3f} | "
                     f"{one.mean('simulation'):.3f} | {against} | {len(one.scores)} |")
     return [*text, ""]

@@ -13,7 +13,8 @@ CANNOT = {"hammerstein": "the first entry answers it", "missing": "the first ent
 def state_space(r):
     fit = optid.fit(optid.Data(u=r["u"], y=r["y"]), "hammerstein_ss.sid", nx=r["nx"], block_rows=r["block_rows"],
                     offset=False, feedthrough=False)
-    return {"one_step": lambda u, y: fit.model.predict(optid.Data(u=u, y=y)),
+    # the gain of the noise is estimated, by maximum likelihood, when the model is first asked for
+    return {"later": lambda: fit.model, "one_step": lambda u, y: fit.model.predict(optid.Data(u=u, y=y)),
             "simulate": lambda u, y: fit.model.simulate(u)}
 
 
