@@ -46,6 +46,8 @@ TRUSTED, NEAR = 10.0, 1e-2
 CONFLICT = 0.1  # share of the errors above the free optimum from which descents from other signs are worth their time
 SIGNED = 60  # programmes of a descent from other signs, which goes on only where it is better
 MOVED = 30  # the same of one from poles that were moved
+# programmes over which the fall of such a descent is taken, and how many times this fall it is given to come near
+OVER, AHEAD = 10, 10
 GOING, WORTH = 4, 1e-4  # how often an end that has not arrived is gone on from, and the share of the errors that pays
 # moves of poles along a border; share of the errors that one must gain, and all of them for an end to be no optimum
 ROUNDS, ALONG, BETTER = 12, 1e-6, 1e-5
@@ -273,24 +275,30 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
     for x in () if known else (here.x, *slow):
         end = yield from _with_poles(problem, x, problem.builders, figures)
         held += [] if end is None else [criterion.variables.pack(end.values or {})]
-    best = yield from _gone_on(problem, best, figures)
     slow_ones = [start for x in slow for start in (x, *sign_variants(problem, x, same=True))]
+    ends = [] if best is None else [best]
     for start in (*sign_variants(problem, here.x, same=True), *sign_variants(problem, here.x), *slow_ones, *held):
-        end = yield from _constrained(_Iterate.of(problem, start), figures, SIGNED)
-        if end is None or best is not None and not end.objective < best.objective * (1 + CONFLICT):
-            continue
-        end = yield from _gone_on(problem, end, figures)
-        if _is_inside(problem, end) and (best is None or end.objective < best.objective):
-            best = end
-    return best
+        least = min((one.objective for one in ends), default=np.inf)
+        end = yield from _constrained(_Iterate.of(problem, start), figures, SIGNED, least * (1 + CONFLICT))
+        ends += [] if end is None else [end]
+    best, least = None, min((one.objective for one in ends), default=np.inf)
+    for end in sorted(ends, key=lambda one: one.objective):
+        if end.objective <= least * (1 + CONFLICT) or best is None:
+            end = yield from _gone_on(problem, end, figures, np.inf if best is None else best.objective)
+            if _is_inside(problem, end) and (best is None or end.objective < best.objective):
+                best = end
+    return best or next(iter(ends), None)
 
 
-def _gone_on(problem: Problem, end: Evidence | None, figures: Mapping[str, Any]) -> Procedure:
-    """Go on from an end that has not arrived, while that lowers the errors by what is worth it or leads inside."""
+def _gone_on(problem: Problem, end: Evidence, figures: Mapping[str, Any], rival: float) -> Procedure:
+    """Go on from an end that has not arrived, while that lowers the errors by what is worth it or leads inside.
+
+    Where they fall too slowly to come below a rival, it is left.
+    """
     for _ in range(GOING):
-        if end is None or end.status is Status.LOCAL:
+        if end.status is Status.LOCAL:
             break
-        again, inside = (yield from _constrained(_end_of(problem, end), figures)), _is_inside(problem, end)
+        again, inside = (yield from _constrained(_end_of(problem, end), figures, rival=rival)), _is_inside(problem, end)
         if again is None or inside and not (_is_inside(problem, again) and again.objective < end.objective):
             break
         worth = not inside or again.objective < end.objective * (1 - WORTH)
@@ -308,13 +316,21 @@ def _end_of(problem: Problem, end: Evidence) -> _Iterate:
     return _Iterate.of(problem, criterion_of(problem).variables.pack(end.values or {}))
 
 
-def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) -> Procedure:
-    """Solve tangent programmes until an undamped one gains nothing; an exact penalty judges the steps."""
+def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS, rival: float = np.inf) -> Procedure:
+    """Solve tangent programmes until an undamped one gains nothing; an exact penalty judges the steps.
+
+    It ends, without evidence, where its errors fall too slowly to come down to those of a rival.
+    """
     previous: _Iterate | None = None
     damping, growth, weight, last, idle, more = 0.0, 4.0, 0.0, np.inf, 0, 0
     answered, curvature, since = False, Curvature(here.x.size), here.at.value
     entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
+    rival, passed = rival / here.criterion.unit, np.inf
     for count in range(1, most + 1):
+        if count % OVER == 0:
+            if entered and here.at.value - AHEAD * (passed - here.at.value) > rival:
+                return None
+            passed = here.at.value if entered else np.inf
         at = curvature.add_to(here.at) if curvature.used else here.at
         plain = at is here.at and not damping
         solution = yield here.tangent if plain else step_problem(here.problem, here.x, at, damping)
