@@ -47,7 +47,7 @@ CONFLICT = 0.1  # share of the errors above the free optimum from which descents
 SIGNED = 60  # programmes of a descent from other signs, which goes on only where it is better
 MOVED = 30  # the same of one from poles that were moved
 # programmes over which the fall of such a descent is taken, and how many times this fall it is given to come near
-OVER, AHEAD = 10, 10
+OVER, AHEAD = 5, 10
 GOING, WORTH = 4, 1e-4  # how often an end that has not arrived is gone on from, and the share of the errors that pays
 # moves of poles along a border; share of the errors that one must gain, and all of them for an end to be no optimum
 ROUNDS, ALONG, BETTER = 12, 1e-6, 1e-5
