@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.bases import Basis, Linear
@@ -25,7 +25,7 @@ from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.process.unknowns import ProcessUnknowns
 from optid.models.nonlinearity import Nonlinearity
-from optid.models.process import ProcessModel
+from optid.models.process import ProcessModel, name_of_pair
 from optid.models.process_dynamics import ProcessDynamics
 from optid.models.process_kernel import thin_out
 from optid.program.compressed import Spread
@@ -94,11 +94,8 @@ class ProcessErrors(Criterion):
         return isinstance(self.bases[self.unknowns.pairs[p][1]], Linear)
 
     def key(self, name: str, number: int) -> str:
-        """Name a quantity of a pair: plain with one input, ``name[input]`` with several, ``name[output,input]``."""
-        o, c = self.unknowns.pairs[number]
-        if self.unknowns.outputs > 1:
-            return f"{name}[{self.data.outputs[o]},{self.data.inputs[c]}]"
-        return name if self.data.m == 1 else f"{name}[{self.data.inputs[c]}]"
+        """Name a quantity of a pair; see `name_of_pair`."""
+        return name_of_pair(name, self.unknowns.pairs[number], self.data)
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 
@@ -320,12 +317,6 @@ class ProcessErrors(Criterion):
         return bool(np.isfinite(x).all() and np.all(np.abs(numbers) <= LARGEST)
                     and np.all(np.abs(numbers[u.logarithmic]) < LARGEST_LOG)
                     and all(numbers[place] >= -AT_KINK for place in u.delays.values()))
-
-    def with_linear(self, x: Array, linear: ArrayLike) -> Array:
-        """Return the dynamics of x with other linear unknowns."""
-        found = np.array(x, dtype=float)
-        found[self.unknowns.linear] = linear
-        return found
 
     def model(self, values: Mapping[str, Array]) -> ProcessModel:
         """Return the model of named values in the units of the record."""
