@@ -174,12 +174,6 @@ class ProcessDynamics:
         f, row = self._chain
         return f[2:, 2:], f[2:, 0], row[2:], float(row[0])
 
-    @property
-    def plain(self) -> tuple[Array, Array]:
-        """System (F, C) that reads the output alone; see `process_kernel.run`."""
-        f, row = self._chain
-        return f, row[None]
-
     @cached_property
     def sensitive(self) -> tuple[Array, Array]:
         """System (F, C) that reads the output and its derivatives by all parameters, C (1 + k, n)."""
@@ -221,15 +215,15 @@ class ProcessDynamics:
             late: whether a delayed change of the input that falls on an instant belongs to the slope there.
             sensitive: whether the derivatives by all parameters are returned, too.
         """
-        f, c = self.sensitive if sensitive else self.plain
-        return run(f, c, instants, changes + self.dead_time, np.ascontiguousarray(inputs),
+        f, c = self.sensitive if sensitive else self._chain
+        return run(f, np.atleast_2d(c), instants, changes + self.dead_time, np.ascontiguousarray(inputs),
                    (straight, late), np.zeros((len(f), inputs.shape[1])))
 
     def free_response(self, instants: Array, first: float) -> Array:
         """Return the responses (N, n) of the output to unit states of all sections at a first time, without input."""
-        (f, c), n = self.plain, self.structure.order
+        (f, row), n = self._chain, self.structure.order
         start = np.vstack([np.zeros((2, n)), np.eye(n)])
-        return run(f, c, instants, np.array([first]), np.zeros((1, n)), (False, True), start)[:, 0]
+        return run(f, row[None], instants, np.array([first]), np.zeros((1, n)), (False, True), start)[:, 0]
 
     def transfer(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return G(s) exp(-theta s) at complex s."""
