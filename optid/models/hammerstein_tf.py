@@ -17,7 +17,6 @@ from optid.data.channels import Transform
 from optid.errors import DataError, StructureError
 from optid.models import recursions, roots, text
 from optid.models.experiments import Record, check_inputs, samples_of, scaled_least_squares, signal_units
-from optid.models.files import KINDS
 from optid.models.gauges import GAUGES, gauge_factor, plant_sign
 from optid.models.layout import Layout
 from optid.models.model import Model, static_solution
@@ -442,6 +441,3 @@ class HammersteinTF(Model):
         elif "plant" in content:
             content = {**content["plant"], "c": content["c"], "d": content["d"]}
         return super().from_dict(content, functions)
-
-
-KINDS |= {"HammersteinTF": HammersteinTF.from_dict, "HammersteinARX": HammersteinTF.from_dict}

@@ -15,10 +15,11 @@ from optid.data.channels import Transform
 from optid.errors import StructureError
 from optid.models import roots
 from optid.models.equilibria import equilibria
+from optid.models.experiments import operating_point
 from optid.models.feedback_tables import tabulate
 from optid.models.gauges import plant_signs
 from optid.models.kalman import NoiseCovariances
-from optid.models.model import Model, frequency_response, impulse_response, static_solution
+from optid.models.model import Model, impulse_response, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_signals import Parts
 
@@ -177,14 +178,6 @@ class StateSpace(Model):
         """Eigenvalues of A, complex (n,), largest first: the poles with the feedback g and L taken as given signals."""
         return roots.largest_first(np.linalg.eigvals(self.A).astype(complex))
 
-    def impulse_response(self, n: int = 100) -> Array:
-        """Return the response of (A, B, C, D) to a unit impulse of every f, (n, l, r), in the gauge of the model."""
-        return impulse_response(self.A, self.B, self.C, self.D, n)
-
-    def frequency_response(self, w: ArrayLike) -> Array:
-        """Return C (zI - A)^-1 B + D at the frequencies w (radians per unit of time), complex (len(w), l, r)."""
-        return frequency_response(self.A, self.B, self.C, self.D, w, self.dt)
-
     def equilibrium(self, u0: ArrayLike, near: ArrayLike | None = None) -> tuple[Array, Array]:
         """Return a state (n,) and outputs (l,) at which the model rests under constant inputs u0 (m,).
 
@@ -194,7 +187,7 @@ class StateSpace(Model):
         Raises:
             StructureError: u0 of the wrong size, a pole at 1, or no equilibrium found.
         """
-        u = self._operating_point(u0)[None]
+        u = operating_point(self, u0)[None]
         x, y = equilibria(self, self.expand_inputs(u), u, None if near is None else np.reshape(near, (1, self.nx)))
         return x[0], y[0]
 
