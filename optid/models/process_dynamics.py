@@ -280,12 +280,12 @@ def read_structures(process: Any, inputs: Sequence[str], outputs: Sequence[str] 
     One type is that of all pairs, one per input that of every output; rows may follow one another in one list
     (`StructureError`: other numbers of them, an output without any process).
     """
-    several = isinstance(process, list | tuple)
-    if several and len(process) == len(inputs) * len(outputs) and all(word is None or isinstance(
-            word, str | ProcessStructure) for word in process):
-        process = [process[i : i + len(inputs)] for i in range(0, len(process), len(inputs))]
-    rows = list(process) if several and any(isinstance(row, list | tuple) for row in process) else (
-        [process] * len(outputs))
+    rows = [process] * len(outputs)
+    if isinstance(process, list | tuple):
+        if any(isinstance(row, list | tuple) for row in process):
+            rows = list(process)
+        elif len(process) == len(inputs) * len(outputs):
+            rows = [process[i : i + len(inputs)] for i in range(0, len(process), len(inputs))]
     if len(rows) != len(outputs):
         raise StructureError(f"process has {len(rows)} rows for {len(outputs)} outputs ({', '.join(outputs)}): one row "
                              "of types per output, one type per input")

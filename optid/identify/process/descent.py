@@ -73,6 +73,30 @@ class ProcessPoint:
         direction[others] = -np.linalg.lstsq(slopes[:, others], slopes[:, place], rcond=1e-10)[0]
         return direction
 
+    def falls_along(self, box: "ProcessBox") -> float:
+        """Return by which share the sum of squares falls at most along the Gauss-Newton step, whole or in any part.
+
+        Where the record hardly shows a direction the step is long, and what its linear model promises does not come.
+        """
+        step = np.linalg.lstsq(self.slopes(), self.rest, rcond=1e-14)[0]
+        least = min(self.at(box.clip(self.numbers + part * step)).value for part in 0.25 ** np.arange(25))
+        return max(1 - least / max(self.value, 1e-300), 0.0)
+
+    def join_equal(self) -> "ProcessPoint":
+        """Return the point with time constants made equal that differ little, where that costs nothing.
+
+        The errors are symmetric in them: where a complex pair would fit better, the best real poles are equal.
+        """
+        x, u = self.x.copy(), self.errors.unknowns
+        for p, structure in enumerate(u.structures):
+            logs = x[u.slices[f"dynamics{p}"]][: structure.real]  # a view
+            for i in range(1, structure.real):
+                one, other = np.argsort(-logs)[i - 1 : i + 1]
+                if logs[one] - logs[other] < EQUAL:
+                    logs[[one, other]] = (logs[one] + logs[other]) / 2
+        joined = ProcessPoint.of(self.errors, x)
+        return joined if joined.value <= self.value * (1 + COSTS_NOTHING) else self
+
     @property
     def noise(self) -> float:
         """Standard deviation of the errors."""
@@ -171,32 +195,6 @@ def sharpen(start: ProcessPoint, box: ProcessBox) -> tuple[ProcessPoint, int]:
         box = box.within(place, *start.errors.cell(start.x, p))
     end, steps = descend(start.errors, start.x, box, steps=VALLEY, tolerance=SHARP)
     return min(start, end, key=lambda one: one.value), steps
-
-
-def falls_along(start: ProcessPoint, box: ProcessBox) -> float:
-    """Return by which share the sum of squares falls at most along the Gauss-Newton step, whole or in any part.
-
-    Where the record hardly shows a direction the step is long, and what its linear model promises does not come.
-    """
-    step = np.linalg.lstsq(start.slopes(), start.rest, rcond=1e-14)[0]
-    least = min(start.at(box.clip(start.numbers + part * step)).value for part in 0.25 ** np.arange(25))
-    return max(1 - least / max(start.value, 1e-300), 0.0)
-
-
-def join_equal(start: ProcessPoint) -> ProcessPoint:
-    """Return the point with time constants made equal that differ little, where that costs nothing.
-
-    The errors are symmetric in them: where a complex pair would fit better, the best real poles are equal.
-    """
-    x, u = start.x.copy(), start.errors.unknowns
-    for p, structure in enumerate(u.structures):
-        logs = x[u.slices[f"dynamics{p}"]][: structure.real]  # a view
-        for i in range(1, structure.real):
-            one, other = np.argsort(-logs)[i - 1 : i + 1]
-            if logs[one] - logs[other] < EQUAL:
-                logs[[one, other]] = (logs[one] + logs[other]) / 2
-    joined = ProcessPoint.of(start.errors, x)
-    return joined if joined.value <= start.value * (1 + COSTS_NOTHING) else start
 
 
 def _best_cell(start: ProcessPoint, box: ProcessBox, p: int, place: int) -> ProcessPoint:

@@ -241,15 +241,6 @@ class ProcessErrors(Criterion):
 
     # -- what descents and programmes need ---------------------------------------------------------------------------
 
-    def _matrix(self, x: Array) -> tuple[Array, Array]:
-        """Return the derivatives (rows, size) of the outputs in the order of x, and the errors."""
-        u, linear = self.unknowns, self.columns(x)
-        errors = linear @ x[u.linear] - self.y
-        matrix = np.zeros((len(errors), u.size))
-        matrix[:, u.linear] = linear
-        matrix[:, u.dynamic] = self._between(x, errors)
-        return matrix, errors
-
     def _between(self, x: Array, errors: Array) -> Array:
         """Return `slopes`; a dead time at a kink has a derivative between those of both sides."""
         slopes, u = self.slopes(x), self.unknowns
@@ -284,11 +275,14 @@ class ProcessErrors(Criterion):
 
         They are zero where an output is missing.
         """
-        matrix, errors = self._matrix(x)
-        shared, n = self.unknowns.shared, self.unknowns.n
+        u, matrix = self.unknowns, np.zeros((len(self.y), self.unknowns.size))
+        matrix[:, u.linear] = self.columns(x)
+        errors = matrix[:, u.linear] @ x[u.linear] - self.y
+        matrix[:, u.dynamic] = self._between(x, errors)
+        shared, n = u.shared, u.n
 
         def of(i: int) -> Iterator[tuple[Array, int]]:
-            block = np.zeros((len(self.instants[i]), self.unknowns.outputs, n + shared + 1))
+            block = np.zeros((len(self.instants[i]), u.outputs, n + shared + 1))
             here = [one for one in self.courses if one.experiment == i]
             for one in here:
                 states = slice(shared + i * n, shared + (i + 1) * n)

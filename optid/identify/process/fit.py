@@ -14,29 +14,13 @@ from optid.identify.arguments import enough_rows
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import CONFIRMED, refine
 from optid.identify.prediction_error.tangent_problem import INSIDE, excess
-from optid.identify.process.descent import (
-    LONG,
-    ProcessBox,
-    ProcessPoint,
-    descend,
-    falls_along,
-    join_equal,
-    search_cells,
-    sharpen,
-)
+from optid.identify.process.descent import LONG, ProcessBox, ProcessPoint, descend, search_cells, sharpen
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.order import choose_types
 from optid.identify.process.pairs import for_outputs
 from optid.identify.process.profile import ProcessProfiles
 from optid.identify.process.proof import REASON, applies, better_start, certify
-from optid.identify.process.separation import (
-    describe_bounds,
-    describe_equal_ones,
-    describe_flatness,
-    refuse_inseparable,
-    refuse_silence,
-    warn_of_motion,
-)
+from optid.identify.process.separation import examine
 from optid.identify.process.starts import best_descents, usual_box
 from optid.program.solution import Bound, Status
 from optid.solving.solve import Evidence, Procedure
@@ -134,14 +118,9 @@ def _searched(errors: ProcessErrors, box: ProcessBox, complete: bool
     same = sum(one.value <= best.value * (1 + 1e-3) for one in points)
     figures = {"starts": f"{same} of {len(points)} descents from the grid end within 0.1 % of the best"}
     if complete:
-        best, steps = sharpen(join_equal(_past_the_grid(best, box)), box)
-        best = join_equal(best)
-        refuse_silence(best)
-        motion = warn_of_motion(best)  # first: it may be why times do not separate
-        refuse_inseparable(best, box)
-        told = {"start": motion, "bounds": describe_bounds(best),
-                "not determined": describe_flatness(best), "time constants": describe_equal_ones(best)}
-        figures |= {name: said for name, said in told.items() if said}
+        best, steps = sharpen(_past_the_grid(best, box).join_equal(), box)
+        best = best.join_equal()
+        figures |= examine(best, box)
     return best, points, figures, steps
 
 
@@ -161,7 +140,7 @@ def _past_the_grid(best: ProcessPoint, box: ProcessBox) -> ProcessPoint:
 def _judged_along(bests: Sequence[ProcessPoint], boxes: Sequence[ProcessBox], evidence: Evidence) -> Evidence:
     """Judge a point that the last programme would move far, in a direction that the record hardly shows."""
     flat = [said for name, said in evidence.figures.items() if name.startswith("not determined")]
-    if max(map(falls_along, bests, boxes)) <= CONFIRMED:
+    if max(map(ProcessPoint.falls_along, bests, boxes)) <= CONFIRMED:
         return replace(evidence, status=Status.LOCAL)
     return replace(evidence, reason=f"{evidence.reason}{'; not determined is ' * bool(flat)}{'; '.join(flat)}")
 

@@ -108,16 +108,9 @@ def _average(mean, value, kept):
 
 @cached_njit
 def _add_course(found, rough, t, move, middle, slow, fast):
-    """Add the response to one move of the input, and how far it is from those of the corners of a box.
+    """Add the response to one move (time, size) and its derivatives (4, N), and how far (N,) it is from the corners'.
 
-    Args:
-        found: (4, N) response and derivatives, added to.
-        rough: (N,) distances, added to.
-        t: (N,) instants.
-        move: its time and size.
-        middle: time constants and dead time in the middle of the box.
-        slow: the largest of the box.
-        fast: the smallest.
+    Time constants and dead time are those in the middle of the box, its largest (slow) and its smallest ones (fast).
     """
     for k in range(len(t)):
         since = t[k] - move[0]
