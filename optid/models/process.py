@@ -225,20 +225,18 @@ class ProcessModel(Model):
     def _scaled(self) -> tuple[ProcessDynamics, ...]:
         return tuple(one.in_unit(self.dt) for one in self.processes)
 
-    def respond(self, u: Array, instants: Array | None = None, read_at: Array | None = None) -> Array:
-        """Return the outputs (N, l) to inputs (J, m) from rest, at any instants; (N,) of a model with one output.
+    def respond(self, u: Array, instants: Array | None = None) -> Array:
+        """Return the outputs (N, l) to inputs (N, m) from rest, at any instants; (N,) of a model with one output.
 
         Args:
             u: inputs, none missing.
-            instants: (J,) times of the inputs, increasing; multiples of dt by default.
-            read_at: (N,) times of the outputs, not decreasing; those of the inputs by default.
+            instants: (N,) their times, increasing; multiples of dt by default.
         """
         t = np.arange(float(len(u))) if instants is None else np.asarray(instants, dtype=float) / self.dt
-        at = t if read_at is None else np.asarray(read_at, dtype=float) / self.dt
-        found, straight = self.level + self.drift * self.dt * (at - t[0])[:, None], self.hold == "first"
+        found, straight = self.level + self.drift * self.dt * (t - t[0])[:, None], self.hold == "first"
         for (o, c), one, f in zip(self.pairs, self._scaled, self.nonlinearities):
             changes, values = thin_out(t, f(u[:, c])[:, None], straight)
-            found[:, o] += one.response(at, changes, values - values[0], straight=straight)[:, 0, 0]
+            found[:, o] += one.response(t, changes, values - values[0], straight=straight)[:, 0, 0]
             found[:, o] += 0.0 if one.structure.integrator else values[0, 0]
         return found[:, 0] if self.l == 1 else found
 
