@@ -19,7 +19,8 @@ from optid.models import recursions, roots, text
 from optid.models.experiments import Record, check_inputs, samples_of, scaled_least_squares, signal_units
 from optid.models.gauges import GAUGES, gauge_factor, plant_sign
 from optid.models.layout import Layout
-from optid.models.model import Model, static_solution
+from optid.models.linear import static_solution
+from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.recursions import autoregression, predict_regression
 

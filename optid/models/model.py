@@ -17,6 +17,7 @@ from optid.data.stretches import runs_of
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models import conversion, export, files, fmu, generated_code, roots
 from optid.models.experiments import Record, named_channels, operating_point, records_of, state_like
+from optid.models.linear import frequency_response, impulse_response
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.roots import AT_ONE
 
@@ -376,31 +377,6 @@ class Model(Ports):
         """
         return files.write(self.to_dict() | ({"record": dict(record)} if record else {}), path, files.FORMAT,
                            files.VERSION)
-
-
-def impulse_response(A: Array, B: Array, C: Array, D: Array, n: int) -> Array:
-    """Return D, C B, C A B, ..., (n, l, r)."""
-    response, x = np.zeros((n, len(C), B.shape[1])), B
-    response[:1] = D
-    with np.errstate(all="ignore"):
-        for k in range(1, n):
-            response[k] = C @ x
-            x = A @ x
-    return response
-
-
-def frequency_response(A: Array, B: Array, C: Array, D: Array, w: ArrayLike, dt: float) -> Array:
-    """Return C (zI - A)^-1 B + D at the frequencies w (radians per unit of time), complex (len(w), l, r)."""
-    z = np.exp(1j * np.atleast_1d(np.asarray(w, dtype=float)) * dt)
-    resolvent = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B.astype(complex))
-    return np.asarray(C @ resolvent + D)
-
-
-def static_solution(matrix: Array, right: Array) -> Array:
-    """Solve the equations of a steady state; refuse those of an integrator, which are singular (`StructureError`)."""
-    if matrix.size and np.linalg.svd(matrix, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(matrix).max()):
-        raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
-    return np.asarray(np.linalg.solve(matrix, right), dtype=float)
 
 
 def _in_json(value: Any) -> Any:

@@ -14,7 +14,8 @@ from optid.data.channels import check_texts
 from optid.errors import DataError, StructureError
 from optid.models.experiments import Record, check_inputs, signal_units
 from optid.models.held_inputs import held_step
-from optid.models.model import Model, static_solution
+from optid.models.linear import static_solution
+from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_simulation import allowed_range
 

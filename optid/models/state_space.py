@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag, solve_discrete_lyapunov
+from scipy.linalg import block_diag
 
 from optid.arrays import Array, finite
 from optid.bases import Linear
@@ -19,7 +19,8 @@ from optid.models.experiments import operating_point
 from optid.models.feedback_tables import tabulate
 from optid.models.gauges import plant_signs
 from optid.models.kalman import NoiseCovariances
-from optid.models.model import Model, impulse_response, static_solution
+from optid.models.linear import balancing, impulse_response, static_solution
+from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_signals import Parts
 
@@ -202,14 +203,13 @@ class StateSpace(Model):
             f[:, j] = self.nonlinearities[j](points)
         return equilibria(self, f, u)[1]
 
-    def _static_gain(self, points: Array) -> Array:
-        return self.gain_at_rest(points)
-
     def gain_at_rest(self, u0: Array, near: ArrayLike | None = None) -> Array:
         """Return the slope (l, m) of the steady-state characteristic at an equilibrium; arguments as `equilibrium`."""
         x, y = self.equilibrium(u0, near)
         A, B, C, D = (one[0] for one in self.tangent(x[None], y[None], u0[None]))
         return D - C @ static_solution(A - np.eye(self.nx), B)
+
+    _static_gain = gain_at_rest
 
     def tangent(self, x: Array, y: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """Return A, B, C, D of the free run near states (N, n), outputs (N, l) and inputs (N, m), N of each."""
@@ -375,27 +375,3 @@ def _shapes(*sizes: int) -> dict[str, tuple[int, ...]]:
     """Shapes of the matrices for n, m, l, r, s and k."""
     size = dict(zip("nmlrsk", sizes))
     return {name: tuple(size[letter] for letter in letters) for name, letters in (MATRICES | COVARIANCES).items()}
-
-
-def balancing(A: Array, B: Array, C: Array) -> Array:
-    """Return the change of states T (n, n) that makes both Gramians of (A, B, C) diagonal and equal.
-
-    Raises:
-        StructureError: A is unstable, or the triple is not minimal.
-    """
-    largest = roots.spectral_radius(A)
-    if largest >= 1:
-        raise StructureError(f"The model is unstable (largest pole {largest:.6g}): it has no Gramians.")
-    reach = _root(solve_discrete_lyapunov(A, B @ B.T))
-    see = _root(solve_discrete_lyapunov(A.T, C.T @ C))
-    left, values, right = np.linalg.svd(see.T @ reach)
-    if values[-1] <= 1e-13 * values[0]:
-        raise StructureError(
-            f"The model is not minimal: its Hankel singular values fall from {values[0]:.3g} to {values[-1]:.3g}. "
-            "Identify it with fewer states.")
-    return (left / np.sqrt(values)).T @ see.T
-
-
-def _root(gramian: Array) -> Array:
-    values, vectors = np.linalg.eigh((gramian + gramian.T) / 2)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
