@@ -16,7 +16,7 @@ REACH = 4.0  # norm of F h up to which the series is applied to the state itself
 TERMS = 24  # of a series, at most, for a norm of one
 
 
-@cached_njit
+@cached_njit(inline="always")  # a call counts references to its arrays, which takes as long as the product
 def _multiply(left, right, into):
     """Write the product of two matrices; many entries of the left one are zero."""
     for i in range(left.shape[0]):
@@ -28,7 +28,7 @@ def _multiply(left, right, into):
             into[i, c] = total
 
 
-@cached_njit
+@cached_njit(inline="always")
 def _copy(matrix, into):
     for i in range(matrix.shape[0]):
         for c in range(matrix.shape[1]):
@@ -149,7 +149,7 @@ def run(F, C, instants, changes, inputs, sides, start):  # noqa: N803
                     lengths[slot] = h
                 if slot >= 0:
                     _multiply(kept[slot], z, into)
-                    z, into = into, z
+                    _copy(into, z)
                 else:
                     recent[noted], noted = h, (noted + 1) % SLOTS
                     _series(F, h, norm, z, term, into)
