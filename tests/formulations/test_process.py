@@ -447,15 +447,6 @@ def test_a_motion_is_named_where_it_keeps_times_from_separating():
         fit(optid.Data(STEP, y + 0.04 * np.random.default_rng(0).normal(size=200), dt=1.0))
 
 
-def test_stamps_that_run_backwards_are_refused_by_sample():
-    t = T.copy()
-    t[50] = t[48]
-    refuses(DataError, "runs backwards at sample 50", optid.Data, STEP, STEP, times=t)
-    t[50] = t[49]
-    refuses(DataError, "stands still at sample 50", optid.Data, STEP, STEP, times=t)
-    refuses(DataError, "one for each sample", optid.Data, STEP, STEP, times=t[:-1])
-
-
 def test_time_constant_and_dead_time_that_cannot_be_separated():
     """A response that is over between two samples shows one number of the two."""
     y = 5 + 2.0 * (T >= 13) - 0.6 * (T == 13) + 1e-3 * np.random.default_rng(0).normal(size=200)

@@ -277,7 +277,8 @@ def test_what_needs_even_distances_refuses_other_records():
 @pytest.mark.parametrize(("times", "message"), [
     ([0.0, 1.0, np.nan], "sample 2 is not finite"), ([0.0, 1.0], r"shape \(2,\)"),
     (["a", "b", "c"], "seconds or dates"),
-    ([0.0, 2.0, 1.0], "runs backwards at sample 2"), ([[0.0, 1.0, 2.0]] * 2, "2 arrays for 1 experiments")])
+    ([0.0, 2.0, 1.0], "runs backwards at sample 2"), ([0.0, 1.0, 1.0], "stands still at sample 2"),
+    ([0.0, 1.0], "one for each sample"), ([[0.0, 1.0, 2.0]] * 2, "2 arrays for 1 experiments")])
 def test_impossible_times_are_refused(times, message):
     refuses(DataError, message, optid.Data, np.arange(3.0), np.arange(3.0), times=times)
 

@@ -115,15 +115,11 @@ def test_user_functions_are_called_with_symbols():
     assert iterate(model.to_casadi(), u, state) == pytest.approx(model.simulate(u, x0=state), abs=1e-12)
 
 
-def test_a_user_function_that_takes_arrays_only_is_refused():
-    functions = UserFunctions((special.j1,), ("bessel",)).with_interval(-1, 1)
-    refuses(StructureError, "CasADi scalar", siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi)
-
-
-def test_a_user_function_that_means_something_else_of_symbols_is_refused():
-    functions = UserFunctions((lambda v: v * (2.0 if isinstance(v, np.ndarray) else 3.0),), ("two",)).with_interval(-1,
-                                                                                                                    1)
-    refuses(StructureError, "other values", siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi)
+@pytest.mark.parametrize(("function", "words"), [
+    (special.j1, "CasADi scalar"), (lambda v: v * (2.0 if isinstance(v, np.ndarray) else 3.0), "other values")])
+def test_a_user_function_that_symbols_do_not_pass_or_change_is_refused(function, words):
+    functions = UserFunctions((function,), ("own",)).with_interval(-1, 1)
+    refuses(StructureError, words, siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi)
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on PATH")
