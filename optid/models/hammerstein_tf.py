@@ -72,7 +72,7 @@ class HammersteinTF(Model):
     GAUGES = GAUGES
     SIMULATORS = ("predict", "free")
     equation, coefficients, noise = text.equations, text.coefficients, property(text.noise)
-    state, following, _fitted = transfer_states.state, transfer_states.following, transfer_states.fitted
+    state, following, _fitted = transfer_states.state, transfer_states.following, transfer_states.fit_state
 
     def __post_init__(self) -> None:
         a, offset = finite(self.a, "a"), np.atleast_1d(finite(self.offset, "offset"))

@@ -16,7 +16,7 @@ from optid.models.experiments import check_inputs, samples_of, scaled_least_squa
 FORGOTTEN = 1e-12  # a free response below this share of its start carries no information about the initial state
 
 
-def fitted(model: Any, simulator: str, u: Array, y: Any, label: str) -> Array:
+def fit_state(model: Any, simulator: str, u: Array, y: Any, label: str) -> Array:
     """Estimate the initial state, the level included, by least squares of a simulator's errors.
 
     The errors of each output count in units of its standard deviation, so that the estimate does not depend on
