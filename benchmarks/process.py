@@ -22,7 +22,7 @@ from scipy.signal import lsim
 import optid
 from optid.identify.process.order import choose_type
 from optid.identify.process.proof import BranchAndBound
-from optid.identify.process.record import Terms, process_errors
+from optid.identify.process.record import process_errors
 from optid.identify.process.starts import usual_box
 from optid.models.process import process_model
 
@@ -287,7 +287,7 @@ def order(runs):
         for seed in range(runs):
             clean = process_model(word, K=2.0, level=5.0, **parameters).respond(u[:, None])
             y = clean + 0.02 * np.ptp(clean) * np.random.default_rng([seed, 9]).normal(size=200)
-            structure, said = choose_type(process_errors(optid.Data(u, y), "P1D", "linear", Terms()))
+            structure, said = choose_type(process_errors(optid.Data(u, y), "P1D", "linear"))
             name = structure.word
             chosen[name], open_ = chosen.get(name, 0) + 1, open_ + ("not dis" in said)
         right, tried = right + (word != "P3D") * chosen.get(word, 0), tried + (word != "P3D") * runs
@@ -306,7 +306,7 @@ def main():
     warnings.simplefilter("ignore")
     data = draw("step", 0, 0.02)[0]
     _ = optid.fit(data, "process.exact", process="P1D").params  # compiled
-    errors = process_errors(data, "P1D", "linear", Terms())
+    errors = process_errors(data, "P1D", "linear")
     BranchAndBound(errors, usual_box(errors)).search(np.inf, 0.1, 1.0)
     if "cases" in parts:
         cases(given.runs, given.case)

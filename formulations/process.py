@@ -32,7 +32,7 @@ from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.fit import fit_processes
-from optid.identify.process.record import Terms, process_errors
+from optid.identify.process.record import process_errors
 from optid.models.process_dynamics import ProcessStructure
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
@@ -77,7 +77,7 @@ def process(data: Data, *, process: str | Sequence[Any] = "", poles: int = 1, ze
     if order and process:
         raise StructureError(f"order='auto' chooses the type, which process={process!r} names: give one of both")
     named = process or ProcessStructure(poles, zero=bool(zero), delay=bool(delay), integrator=bool(integrator))
-    errors = process_errors(data, named, basis, Terms(hold, offset, drift, initial))
+    errors = process_errors(data, named, basis, hold, offset, drift, initial)
     return (yield from fit_processes(errors, _problem, constraints, bool(order)))
 
 

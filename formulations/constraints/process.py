@@ -6,7 +6,6 @@ the name of an input, ``output`` that of an output, needed where there are sever
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -31,13 +30,13 @@ def tau(value: float | None = None, low: float | None = None, high: float | None
     Raises:
         StructureError: no bound, crossing ones, one that is not positive, or no such number.
     """
-    names = ("tau", "tau1", "tau2", "tau3")
+    names = ("log tau", "log tau1", "log tau2", "log tau3")
     if number is None:
         return _bounded("tau", names, value, low, high, (channel, output))
     if number not in (1, 2, 3):
         raise StructureError(f"tau: number={number!r} must be 1, 2 or 3; the first time constant is the largest one")
     own, pair = int(number), (channel, output)
-    parts = [(names[own : own + 1] + ("tau",) * (own == 1), value, low, high)]
+    parts = [(names[own : own + 1] + names[:1] * (own == 1), value, low, high)]
     least, most = (low, high) if value is None else (value, value)
     parts += [(names[1:own], None, least, None)] * (least is not None and own > 1)
     parts += [(names[own + 1 :], None, None, most)] * (most is not None and own < 3)
@@ -45,7 +44,7 @@ def tau(value: float | None = None, low: float | None = None, high: float | None
 
     def build(view: View) -> list[Limit]:
         limits = first.build(view)  # which refuses an input that is missing
-        there = [any(view.key(f"log {name}", channel) in view for name in those) for those, *_ in parts[1:]]
+        there = [any(view.key(name, channel) in view for name in those) for those, *_ in parts[1:]]
         return limits + [limit for rule, has in zip(others, there) if has for limit in rule.build(view)]
 
     return Rule(label(f"tau{own}", *pair), build)
@@ -55,24 +54,20 @@ def tau(value: float | None = None, low: float | None = None, high: float | None
 def T(value: float | None = None, low: float | None = None, high: float | None = None,  # noqa: N802
       channel: str | None = None, output: str | None = None) -> Rule:
     """The time constant of the second-order factor equals ``value`` or lies in [low, high]; errors as of `tau`."""
-    return _bounded("T", ("T",), value, low, high, (channel, output))
+    return _bounded("T", ("log T",), value, low, high, (channel, output))
 
 
 @record_arguments
 def zeta(value: float | None = None, low: float | None = None, high: float | None = None, channel: str | None = None,
          output: str | None = None) -> Rule:
     """The damping of the second-order factor equals ``value`` or lies in [low, high]; errors as of `tau`."""
-    return _bounded("zeta", ("zeta",), value, low, high, (channel, output))
+    return _bounded("zeta", ("log zeta",), value, low, high, (channel, output))
 
 
 @record_arguments
 def overdamped(channel: str | None = None, output: str | None = None) -> Rule:
     """The damping of the second-order factor is at least one: its poles are real."""
-
-    def build(view: View) -> list[Limit]:
-        return [_lower(view[view.key("log zeta", _input(view, "overdamped", ("log zeta",), (channel, output)))], 1.0)]
-
-    return Rule(label("overdamped", channel, output), build)
+    return _bounded("overdamped", ("log zeta",), None, 1.0, None, (channel, output))
 
 
 @record_arguments
@@ -83,7 +78,7 @@ def tau_zero(value: float | None = None, low: float | None = None, high: float |
     Raises:
         StructureError: no bound, or crossing ones.
     """
-    return _linear("tau_zero", value, low, high, (channel, output))
+    return _bounded("tau_zero", ("tau_zero",), value, low, high, (channel, output))
 
 
 @record_arguments
@@ -95,7 +90,7 @@ def dead_time(value: float | None = None, low: float | None = None, high: float 
         StructureError: no bound, crossing ones, or a negative one.
     """
     _refuse_below("dead_time", 0.0, value, low, high)
-    return _linear("dead_time", value, low, high, (channel, output))
+    return _bounded("dead_time", ("dead_time",), value, low, high, (channel, output))
 
 
 @record_arguments
@@ -106,39 +101,27 @@ def K(value: float | None = None, low: float | None = None, high: float | None =
     Raises:
         StructureError: no bound, crossing ones, or a static curve, whose gain has the word "gain".
     """
-    return _linear("K", value, low, high, (channel, output))
+    return _bounded("K", ("K",), value, low, high, (channel, output))
 
 
 def _bounded(word: str, names: Sequence[str], value: float | None, low: float | None, high: float | None,
              pair: Pair) -> Rule:
-    """Return bounds on positive parameters, of which those that the process has are meant."""
+    """Return bounds on parameters, on logarithms of positive ones; those that the process has are meant."""
     check_bounds(word, low if value is None else value, high if value is None else value)
-    _refuse_below(word, np.finfo(float).tiny, value, low, high)
+    logarithmic = names[0].startswith("log ")
+    if logarithmic:
+        _refuse_below(word, np.finfo(float).tiny, value, low, high)
+    given = {"value": value} if value is not None else {"low": low, "high": high}
 
     def build(view: View) -> list[Limit]:
-        one = _input(view, word, [f"log {name}" for name in names], pair)
-        logs = [view[view.key(f"log {name}", one)] for name in names if view.key(f"log {name}", one) in view]
-        if value is not None:
-            return [Limit(log == np.log(value), 1 / value, "value") for log in logs]
-        return [_lower(log, low) for log in logs if low is not None] + [
-            Limit(log <= np.log(high), 1 / high, "high") for log in logs if high is not None]
-
-    return Rule(label(word, *pair), build)
-
-
-def _lower(log: Any, bound: float) -> Limit:
-    return Limit(np.log(bound) - log <= 0, 1 / bound, "low")
-
-
-def _linear(word: str, value: float | None, low: float | None, high: float | None, pair: Pair) -> Rule:
-    check_bounds(word, low if value is None else value, high if value is None else value)
-
-    def build(view: View) -> list[Limit]:
-        entry = view[view.key(word, _input(view, word, [word], pair))]
-        if value is not None:
-            return [Limit(entry == value, 1.0, "value")]
-        return ([Limit(entry >= low, 1.0, "low")] if low is not None else []) + (
-            [Limit(entry <= high, 1.0, "high")] if high is not None else [])
+        one, found = _input(view, word, names, pair), []
+        entries = [view[view.key(name, one)] for name in names if view.key(name, one) in view]
+        for kind, bound in given.items():
+            for entry in entries if bound is not None else ():
+                end, unit = (np.log(bound), 1 / bound) if logarithmic else (bound, 1.0)
+                member = entry == end if kind == "value" else entry >= end if kind == "low" else entry <= end
+                found.append(Limit(member, unit, kind))
+        return found
 
     return Rule(label(word, *pair), build)
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array, check_integer, finite
-from optid.data.channels import Ports, check_texts, numbered_names, sampling_time
+from optid.data.channels import Ports, sampling_time
 from optid.errors import DataError, StructureError
 from optid.models import roots
-from optid.models.experiments import check_inputs, samples_of, state_like
+from optid.models.experiments import check_inputs, named_channels, operating_point, samples_of, state_like
 from optid.models.export import control_names, control_package
 from optid.models.held_inputs import held_step, run_held, split_delays
 from optid.models.nonlinearity import Nonlinearity
@@ -81,14 +81,7 @@ class ContinuousModel(Ports):
         if np.any(fixed["dead_time"] < 0):
             j = int(np.argmax(fixed["dead_time"] < 0))
             raise StructureError(f"dead_time[{j}] = {fixed['dead_time'][j]:g}: it must not be negative.")
-        for kind, letter, count in (("input", "u", m), ("output", "y", sizes["l"])):
-            names = tuple(getattr(self, f"{kind}s")) or numbered_names(letter, count)
-            units = tuple(getattr(self, f"{kind}_units")) or ("",) * count
-            if len(names) != count or len(units) != count:
-                raise StructureError(f"{len(names)} names and {len(units)} units for {count} {kind}s.")
-            check_texts(f"the name or unit of an {kind}", map(str, (*names, *units)), StructureError)
-            fixed |= {f"{kind}s": names, f"{kind}_units": units}
-        for name, value in fixed.items():
+        for name, value in {**fixed, **named_channels(self, m, sizes["l"])}.items():
             object.__setattr__(self, name, value)
 
     # -- what it says ----------------------------------------------------------------------------------------------
@@ -119,9 +112,7 @@ class ContinuousModel(Ports):
 
         An integrator, which does not come to rest, and u0 of another size are refused (`StructureError`).
         """
-        points = np.atleast_1d(np.asarray(u0, dtype=float))
-        if points.shape != (self.m,):
-            raise StructureError(f"u0 has shape {points.shape}; it must be ({self.m},), one operating point per input.")
+        points = operating_point(self, u0)
         slopes = np.zeros((len(self.nonlinearities), self.m))
         for j, (f, c) in enumerate(zip(self.nonlinearities, self.input_of)):
             slopes[j, c] = f.slope(points[c])

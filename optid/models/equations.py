@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.arrays import one_of
 from optid.errors import LookupFailed, StructureError, nearest
 
 Bounds = tuple[float | None, float | None]
@@ -67,9 +68,8 @@ class Equations:
             low, high = self.interval(name)
             if not low <= values[name] <= high or not low < high:
                 raise StructureError(f"{name!r} starts at {values[name]:g}, outside its bounds {tuple(given)}")
-        for word, known in (("time", TIMES), ("hold", HOLDS)):
-            if getattr(self, word) not in known:
-                raise StructureError(f"{word}={getattr(self, word)!r}: use one of {', '.join(known)}")
+        one_of("time", self.time, TIMES)
+        one_of("hold", self.hold, HOLDS)
 
     def interval(self, name: str) -> tuple[float, float]:
         """Return the bounds of a state or parameter as numbers, infinite where open."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import StructureError
-from optid.models.model import static_solution
+from optid.models.linear import static_solution
 
 STEPS, HALVINGS = 100, 30
 RELAXATION = 300  # samples of a free run from whose end the steps start again

@@ -6,11 +6,34 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array, as_samples, is_scalar_list
+from optid.data.channels import check_texts, numbered_names
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 
 # inputs (N, m), outputs (N, l) or None, and the words that name the experiment in a message
 Record = tuple[Array, Array | None, str]
+
+
+def named_channels(model: Any, m: int, l: int) -> dict[str, tuple[str, ...]]:  # noqa: E741 - the field's letter
+    """Return names and units of m inputs and l outputs, defaults where a model has none (`StructureError`: others)."""
+    found: dict[str, tuple[str, ...]] = {}
+    for kind, letter, count in (("input", "u", m), ("output", "y", l)):
+        names = tuple(getattr(model, f"{kind}s")) or numbered_names(letter, count)
+        units = tuple(getattr(model, f"{kind}_units")) or ("",) * count
+        if len(names) != count or len(units) != count:
+            raise StructureError(f"{len(names)} names and {len(units)} units for {count} {kind}s.")
+        check_texts(f"the name of an {kind}", map(str, names), StructureError)
+        check_texts(f"the unit of an {kind}", map(str, units), StructureError)
+        found |= {f"{kind}s": names, f"{kind}_units": units}
+    return found
+
+
+def operating_point(model: Any, u0: ArrayLike) -> Array:
+    """Read constant inputs (m,); refuse another number of them (`StructureError`)."""
+    points = np.atleast_1d(np.asarray(u0, dtype=float))
+    if points.shape != (model.m,):
+        raise StructureError(f"u0 has shape {points.shape}; it must be ({model.m},), one operating point per input.")
+    return points
 
 
 def in_units_of(model: Any, data: Data) -> Data:
@@ -25,19 +48,14 @@ def in_units_of(model: Any, data: Data) -> Data:
     return data if data.transform.is_identity else data.raw()
 
 
-def regular_in_units_of(model: Any, data: Data) -> Data:
-    """Return data as `in_units_of`, and refuse samples at irregular times (`DataError`)."""
-    data.refuse_irregular("this model")
-    return in_units_of(model, data)
-
-
 def records_of(model: Any, data: Any) -> tuple[list[Record], bool]:
     """Return the record of every experiment, and whether the inputs were one-dimensional; errors as `in_units_of`.
 
-    The data are Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
+    The data are Data at regular times, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
     """
     if isinstance(data, Data):
-        flat, pairs = False, [(e.u, e.y) for e in regular_in_units_of(model, data).experiments]
+        data.refuse_irregular("this model")
+        flat, pairs = False, [(e.u, e.y) for e in in_units_of(model, data).experiments]
     else:
         arrays = [data] if is_scalar_list(data) else list(data)
         flat, pairs = all(np.ndim(u) == 1 for u in arrays), [(samples_of(u, "u", model.m), None) for u in arrays]

@@ -6,6 +6,7 @@ import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ from optid.errors import ModelFileError, StructureError
 FORMAT = "optid model"
 VERSION = 1
 
-# what builds a model from the content of its file, by the kind written there; every class enters itself
-KINDS: dict[str, Callable[[dict[str, Any], dict[str, Any] | None], Any]] = {}
+# module and class of a model by the kind written in its file; imported when there is one
+KINDS = {"HammersteinTF": ("hammerstein_tf", "HammersteinTF"), "HammersteinARX": ("hammerstein_tf", "HammersteinTF"),
+         "HammersteinSS": ("hammerstein_ss", "HammersteinSS"), "PhysicalModel": ("physical", "PhysicalModel"),
+         "ProcessModel": ("process", "ProcessModel")}
 
 
 def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
@@ -122,7 +125,8 @@ def from_content(content: dict[str, Any], functions: dict[str, Any] | None = Non
     kind = content["kind"]
     if kind not in KINDS:
         raise ValueError(f"unknown kind of model {kind!r}.")
-    return KINDS[kind](content, functions)
+    module, name = KINDS[kind]
+    return getattr(import_module(f"optid.models.{module}"), name).from_dict(content, functions)
 
 
 def write_state(path: str | Path, kind: str, version: int, head: Mapping[str, Any], arrays: Mapping[str, Any]) -> Path:

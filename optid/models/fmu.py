@@ -21,7 +21,7 @@ from optid.arrays import Array
 from optid.errors import OptidError, StructureError
 from optid.models import files
 from optid.models.experiments import state_like
-from optid.models.generated_code import KEYWORDS, c_kernel, comment_line, description, identifiers
+from optid.models.generated_code import KEYWORDS, c_kernel, check_identifier, comment_line, description, identifiers
 
 SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0, "d": 86400.0}  # time of an FMU is in seconds
 PLATFORMS = {("linux", "x86_64"): ("linux64", ".so"), ("darwin", "x86_64"): ("darwin64", ".dylib"),
@@ -55,9 +55,7 @@ def to_fmu(model: Any, path: str | Path, name: str | None = None, *, x0: Any = N
     if path.suffix != ".fmu":
         raise StructureError(f"{path.name}: the name of an FMU must end in .fmu.")
     name = identifiers([path.stem], "model", KEYWORDS)[0] if name is None else name
-    if not isinstance(name, str) or identifiers([name], "model", KEYWORDS) != [name]:
-        raise StructureError(f"name={name!r} is no identifier of C: use letters, digits and single underscores, a "
-                             "letter first, and no word of the language")
+    check_identifier(name, KEYWORDS, "identifier of C")
     if model.time_unit not in SECONDS:
         raise StructureError(f"The time of an FMU is in seconds; the model counts in {model.time_unit!r}. Use a model "
                              f"with one of the units {', '.join(filter(None, SECONDS))}.")

@@ -30,13 +30,10 @@ FORMULAS: dict[str, tuple[str, str]] = {
     "ASSIGN": ("{0}", "{0}"), "NEG": ("-{0}", "-{0}"), "LIFT": ("{0}", "{0}"),
     "ADD": ("{0} + {1}", "{0} + {1}"), "SUB": ("{0} - {1}", "{0} - {1}"),
     "MUL": ("{0} * {1}", "{0} * {1}"), "DIV": ("{0} / {1}", "{0} / {1}"), "INV": ("1.0 / {0}", "1.0 / {0}"),
-    "SQ": ("{0} * {0}", "{0} * {0}"), "TWICE": ("2.0 * {0}", "2.0 * {0}"), "SQRT": ("sqrt({0})", "SQRT({0})"),
+    "SQ": ("{0} * {0}", "{0} * {0}"), "TWICE": ("2.0 * {0}", "2.0 * {0}"),
     "POW": ("pow({0}, {1})", "EXPT({0}, {1})"), "CONSTPOW": ("pow({0}, {1})", "EXPT({0}, {1})"),
-    "EXP": ("exp({0})", "EXP({0})"), "LOG": ("log({0})", "LN({0})"),
-    "SIN": ("sin({0})", "SIN({0})"), "COS": ("cos({0})", "COS({0})"), "TAN": ("tan({0})", "TAN({0})"),
-    "ASIN": ("asin({0})", "ASIN({0})"), "ACOS": ("acos({0})", "ACOS({0})"), "ATAN": ("atan({0})", "ATAN({0})"),
-    "FABS": ("fabs({0})", "ABS({0})"), "FMIN": ("fmin({0}, {1})", "MIN({0}, {1})"),
-    "FMAX": ("fmax({0}, {1})", "MAX({0}, {1})"),
+    "LOG": ("log({0})", "LN({0})"), "FABS": ("fabs({0})", "ABS({0})"),
+    "FMIN": ("fmin({0}, {1})", "MIN({0}, {1})"), "FMAX": ("fmax({0}, {1})", "MAX({0}, {1})"),
     "LT": ("{0} < {1}", "SEL({0} < {1}, 0.0, 1.0)"), "LE": ("{0} <= {1}", "SEL({0} <= {1}, 0.0, 1.0)"),
     "EQ": ("{0} == {1}", "SEL({0} = {1}, 0.0, 1.0)"), "NE": ("{0} != {1}", "SEL({0} <> {1}, 0.0, 1.0)"),
     "NOT": ("{0} == 0.0", "SEL({0} = 0.0, 0.0, 1.0)"),
@@ -46,11 +43,9 @@ FORMULAS: dict[str, tuple[str, str]] = {
     "SIGN": ("({0} > 0.0) - ({0} < 0.0)", "SEL({0} > 0.0, SEL({0} < 0.0, 0.0, -1.0), 1.0)"),
     "SINH": ("sinh({0})", "(EXP({0}) - EXP(-{0})) / 2.0"), "COSH": ("cosh({0})", "(EXP({0}) + EXP(-{0})) / 2.0"),
     "TANH": ("tanh({0})", "SEL({0} < 0.0, 1.0, -1.0) * (1.0 - EXP(-2.0 * ABS({0}))) / (1.0 + EXP(-2.0 * ABS({0})))"),
-    "FLOOR": ("floor({0})", ""), "CEIL": ("ceil({0})", ""), "FMOD": ("fmod({0}, {1})", ""), "ERF": ("erf({0})", ""),
-    "ASINH": ("asinh({0})", ""), "ACOSH": ("acosh({0})", ""), "ATANH": ("atanh({0})", ""),
-    "ATAN2": ("atan2({0}, {1})", ""), "LOG1P": ("log1p({0})", ""), "EXPM1": ("expm1({0})", ""),
-    "HYPOT": ("hypot({0}, {1})", ""), "COPYSIGN": ("copysign({0}, {1})", ""),
-    "REMAINDER": ("remainder({0}, {1})", "")}
+    **{word: (f"{word.lower()}({{0}})", f"{word}({{0}})") for word in "SQRT EXP SIN COS TAN ASIN ACOS ATAN".split()},
+    **{word: (f"{word.lower()}({{0}})", "") for word in "FLOOR CEIL ERF ASINH ACOSH ATANH LOG1P EXPM1".split()},
+    **{word: (f"{word.lower()}({{0}}, {{1}})", "") for word in "FMOD ATAN2 HYPOT COPYSIGN REMAINDER".split()}}
 
 
 class Language(NamedTuple):
@@ -66,19 +61,12 @@ C = Language(0, "{} = {};", "{}", "C")
 STRUCTURED_TEXT = Language(1, "{} := {};", "LREAL#{}", "IEC 61131-3")
 
 
-class StraightLine(NamedTuple):
-    """A step of a model as assignments."""
-
-    lines: list[str]
-    work: int  # length of the array w of intermediate values
-    states: int
-
-
 def straight_line(model: Any, language: Language, inputs: Sequence[str], outputs: Sequence[str], state: str,
-                  following: str) -> StraightLine:
-    """Write a step of a model: the outputs and the next state from the state and the inputs.
+                  following: str) -> tuple[list[str], int, int]:
+    """Write a step of a model: the outputs and the next state from the state and the inputs, one assignment a line.
 
-    Inputs and outputs are named one by one; states are entries of the arrays `state` and `following`.
+    Inputs and outputs are named one by one; states are entries of the arrays `state` and `following`. Returned are the
+    lines, the length of the array w of intermediate values, and the number of states.
 
     Raises:
         StructureError: equations that are no plain expressions, an operation that the language does not have.
@@ -109,7 +97,7 @@ def straight_line(model: Any, language: Language, inputs: Sequence[str], outputs
             value = formula.format(*(held[i] for i in into))
             held[out[0]] = f"w[{out[0]}]"
             lines.append(language.assignment.format(held[out[0]], value))
-    return StraightLine(lines, max(step.sz_w(), 1), x.numel())
+    return lines, max(step.sz_w(), 1), x.numel()
 
 
 def _number(value: float, language: Language) -> str:
@@ -135,9 +123,7 @@ def to_c(model: Any, path: str | Path, name: str = "model") -> Path:
     Raises:
         StructureError: a name that C does not take, equations without plain expressions, or as `to_casadi`.
     """
-    if not isinstance(name, str) or not re.fullmatch("[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in KEYWORDS:
-        raise StructureError(f"name={name!r} cannot begin the names of C functions: use letters, digits and single "
-                             "underscores, a letter first, and no word of the language")
+    check_identifier(name, KEYWORDS, "beginning of the names of C functions")
     notes = "\n".join(f" * {comment_line(line)}" for line in description(model))
     up, (kernel, states) = name.upper(), c_kernel(model, f"{name}_sample")
     path = Path(path)
@@ -164,15 +150,15 @@ void {name}_step(double *x, const double *u, double *y) {{
 
 def c_kernel(model: Any, name: str) -> tuple[str, int]:
     """Return the C function name(x, u, next, y) of a step, and the number of states."""
-    body = straight_line(model, C, [f"u[{c}]" for c in range(model.m)], [f"y[{o}]" for o in range(model.l)], "x",
-                         "next")
-    lines = "\n".join(f"  {line}" for line in body.lines)
+    lines, work, states = straight_line(model, C, [f"u[{c}]" for c in range(model.m)],
+                                        [f"y[{o}]" for o in range(model.l)], "x", "next")
+    body = "\n".join(f"  {line}" for line in lines)
     return f"""static void {name}(const double *x, const double *u, double *next, double *y) {{
-  double w[{body.work}];
+  double w[{work}];
   (void)w, (void)x, (void)u, (void)next, (void)y;
-{lines}
+{body}
 }}
-""", body.states
+""", states
 
 
 def to_st(model: Any, path: str | Path, name: str = "model") -> Path:
@@ -190,32 +176,30 @@ def to_st(model: Any, path: str | Path, name: str = "model") -> Path:
     Raises:
         StructureError: a name that the language does not take, a function that it does not have, or as `to_casadi`.
     """
-    if identifiers([name] if isinstance(name, str) else [""], "", ST_KEYWORDS) != [name]:
-        raise StructureError(f"name={name!r} is no name of a function block: use letters, digits and single "
-                             "underscores, a letter first, and no word of IEC 61131-3")
+    check_identifier(name, ST_KEYWORDS, "name of a function block in IEC 61131-3")
     taken = ST_KEYWORDS | {"x", "w", "following", name.lower()}
     inputs = identifiers(model.inputs, "u", taken)
     outputs = identifiers(model.outputs, "y", taken | {word.lower() for word in inputs})
-    body = straight_line(model, STRUCTURED_TEXT, inputs, outputs, "x", "following")
+    lines, work, count = straight_line(model, STRUCTURED_TEXT, inputs, outputs, "x", "following")
     notes = "\n".join(f" * {comment_line(line, '*', '()')}" for line in description(model))
 
     def declare(kind: str, names: Iterable[str], more: str = "") -> str:
         return f"VAR{kind}\n" + "".join(f"    {word} : {more}LREAL;\n" for word in names) + "END_VAR\n"
 
-    states = f"ARRAY[0..{body.states - 1}] OF "
-    held = declare("", ["x"], states) if body.states else ""
-    passing = [f"    following : {states}LREAL;\n"] if body.states else []
-    lines = "\n".join([*body.lines, *["x := following;"] * bool(body.states)])
+    states = f"ARRAY[0..{count - 1}] OF "
+    held = declare("", ["x"], states) if count else ""
+    passing = f"    following : {states}LREAL;\n" if count else ""
+    body = "\n".join([*lines, *["x := following;"] * bool(count)])
     path = Path(path)
     path.write_text(f"""(*
 {notes}
  *)
 FUNCTION_BLOCK {name}
 {declare("_INPUT", inputs)}{declare("_OUTPUT", outputs)}{held}VAR_TEMP
-    w : ARRAY[0..{body.work - 1}] OF LREAL;
-{"".join(passing)}END_VAR
+    w : ARRAY[0..{work - 1}] OF LREAL;
+{passing}END_VAR
 
-{lines}
+{body}
 END_FUNCTION_BLOCK
 """, encoding="utf-8")
     return path
@@ -247,6 +231,13 @@ def identifiers(names: Iterable[str], letter: str, taken: Iterable[str] = ()) ->
         used.add(free.lower())
         found.append(free)
     return found
+
+
+def check_identifier(name: Any, taken: Iterable[str], what: str) -> None:
+    """Refuse a name that is none of what it has to be (`StructureError`)."""
+    if not isinstance(name, str) or identifiers([name], "", taken) != [name]:
+        raise StructureError(f"name={name!r} is no {what}: use letters, digits and single underscores, a letter first, "
+                             "and no word of the language")
 
 
 def comment_line(line: str, star: str = "*", ends: str = "//") -> str:

@@ -12,7 +12,6 @@ from optid.models import state_simulation as simulation
 from optid.models import text
 from optid.models.continuous import ContinuousModel
 from optid.models.experiments import Record, records_of
-from optid.models.files import KINDS
 from optid.models.state_space import StateSpace
 
 
@@ -70,5 +69,4 @@ class HammersteinSS(StateSpace):
         return [model.latent_signals(simulation.run_states(run, x), run.u) for run, x in zip(runs, states)]
 
 
-KINDS["HammersteinSS"] = HammersteinSS.from_dict
 ContinuousModel.SAMPLED = HammersteinSS

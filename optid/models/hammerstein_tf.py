@@ -15,18 +15,17 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array, finite
 from optid.data.channels import Transform
 from optid.errors import DataError, StructureError
-from optid.models import recursions, roots, text
-from optid.models.experiments import Record, check_inputs, samples_of, scaled_least_squares, signal_units
-from optid.models.files import KINDS
+from optid.models import recursions, roots, text, transfer_states
+from optid.models.experiments import Record, check_inputs
 from optid.models.gauges import GAUGES, gauge_factor, plant_sign
 from optid.models.layout import Layout
-from optid.models.model import Model, static_solution
+from optid.models.linear import static_solution
+from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.recursions import autoregression, predict_regression
 
 # share of |b| below which sum b counts as zero: the offset of f then has no effect that could be measured
 TINY_SUM = 1e-6
-FORGOTTEN = 1e-12  # a free response below this share of its start carries no information about the initial state
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,6 +72,7 @@ class HammersteinTF(Model):
     GAUGES = GAUGES
     SIMULATORS = ("predict", "free")
     equation, coefficients, noise = text.equations, text.coefficients, property(text.noise)
+    state, following, _fitted = transfer_states.state, transfer_states.following, transfer_states.fit_state
 
     def __post_init__(self) -> None:
         a, offset = finite(self.a, "a"), np.atleast_1d(finite(self.offset, "offset"))
@@ -363,67 +363,6 @@ class HammersteinTF(Model):
                 f"radius {self.radius:.6g}. Identify the model with a stability constraint, or simulate fewer samples.")
         return y
 
-    def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:
-        """Estimate the initial state, the level included, by least squares of a simulator's errors.
-
-        The errors of each output count in units of its standard deviation, so that the estimate does not depend on
-        units. Those of the prediction pass the inverse of the noise filter; ARX and ARMAX predictors have no state, the
-        free run gives it. Directions that the record does not determine are set to zero.
-        """
-        (n, outputs), level = self._state_shape, self.levels is not None
-        if not n:  # without lags there is no state
-            return np.zeros((n, outputs))
-        whitened = simulator == "predict" and self.d is not None
-        radius = max(self.radius, roots.radius(self.c) if whitened else 0.0)
-        forgotten = 10 * n + (int(2 * np.log(FORGOTTEN) / np.log(radius)) if 0 < radius < 1 else 0)
-        count = len(y) if radius >= 1 or level else min(len(y), forgotten)
-        units, rest = signal_units(y), (y - self._simulated(u, np.zeros((n, outputs)), label))[:count]
-        present = np.isfinite(rest)
-        free = self._response(np.eye(outputs)[None], count)
-        columns = np.zeros((count, outputs, n, outputs))
-        for i in range(min(self.largest_lag, count)):
-            columns[i:, :, i] = free[: count - i]
-        if level:
-            columns[:, :, -1] = np.cumsum(free, axis=0)
-        rest, columns = rest / units, columns.reshape(count, outputs, n * outputs) / units[:, None]
-        if whitened:
-            signals = np.where(present, np.column_stack([rest, columns[:, 0]]), np.nan).T
-            errors = [recursions.innovations(s, None, self.c, self.noise_denominator).innovations for s in signals]
-            rest, columns = errors[0][:, None], np.column_stack(errors[1:])[:, None]
-        return scaled_least_squares(columns[present], rest[present]).reshape(n, outputs)
-
-    def state(self, u: ArrayLike, y: ArrayLike) -> Array:
-        """Return the state (n, l) that follows the samples u (N, m) and y (N, l), N >= n, of the plant without noise.
-
-        Row i is what these samples add to the right-hand side of the equation i samples ahead.
-
-        Raises:
-            DataError: too few samples, or one of the last n missing.
-            StructureError: a model with `levels`, of which so few samples do not tell the one of their record.
-        """
-        if self.levels is not None:
-            raise StructureError("Every record of this model has its own constant, which so few samples do not "
-                                 "tell: choose one by at_level, or use initial_state.")
-        u, y, n = samples_of(u, "u", self.m), samples_of(y, "y", self.l), self.largest_lag
-        if len(u) < n or len(u) != len(y):
-            raise DataError(f"The state follows from {n} samples of u and y; got {len(u)} of u and {len(y)} of y.")
-        u, y = u[len(u) - n :], y[len(y) - n :]
-        check_inputs(self, u, "The last samples: ")
-        if np.isnan(y).any():
-            k, o = np.argwhere(np.isnan(y))[0]
-            raise DataError(f"Output {self.outputs[o]!r} is missing {n - k} samples before the end.")
-        return self.following(u, y)
-
-    def following(self, u: Array, y: Array) -> Array:
-        """Return the state (n, l) after n complete samples u (n, m) and y (n, l), see `state`, without checks."""
-        n = self.largest_lag
-        state, f = np.zeros((n, self.l)), np.column_stack([f(one) for f, one in zip(self.nonlinearities, u.T)])
-        for i, matrix in enumerate(self.matrices, start=1):
-            state[:i] -= y[n - i :] @ matrix.T
-        for lag, b in enumerate(self.numerators):
-            state[:lag] += f[n - lag :] @ b.T
-        return state
-
     # -- text and content of files -------------------------------------------------------------------------------
 
     def __str__(self) -> str:
@@ -442,6 +381,3 @@ class HammersteinTF(Model):
         elif "plant" in content:
             content = {**content["plant"], "c": content["c"], "d": content["d"]}
         return super().from_dict(content, functions)
-
-
-KINDS |= {"HammersteinTF": HammersteinTF.from_dict, "HammersteinARX": HammersteinTF.from_dict}

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array, as_list, check_integer, finite, one_of, one_or_all
-from optid.data.channels import Ports, Transform, check_texts, interval_text, numbered_names
+from optid.data.channels import Ports, Transform, interval_text
 from optid.data.record import Data
 from optid.data.stretches import runs_of
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models import conversion, export, files, fmu, generated_code, roots
-from optid.models.experiments import Record, records_of, state_like
+from optid.models.experiments import Record, named_channels, operating_point, records_of, state_like
+from optid.models.linear import frequency_response, impulse_response
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.roots import AT_ONE
 
@@ -63,27 +64,17 @@ class Model(Ports):
     c0: Any
     offset_note: Any
     equation: Callable[..., str]
-    impulse_response: Callable[..., Array]
     static_curve: Callable[[int, Array], Array]
     _static_gain: Callable[[Array], Array]
     _state_shape: Any
-    _predicted: Callable[[Array, Array, int, Array, str], Array]
     _run: Callable[[str, Sequence[Record], Any], list[Array]]
     _fitted: Callable[[str, Array, Any, str], Array]
-    _regauged: Callable[[str, bool], Self]
     _in_raw_units: Callable[[Transform], Self]
 
     def _fix(self, fields: Mapping[str, Any], m: int, l: int) -> None:  # noqa: E741 - the field's letter
         """Set the fields of a new model, with default names and units for m inputs and l outputs, and check them."""
-        fixed = {**fields, "nonlinearities": tuple(fields["nonlinearities"]), "dt": float(self.dt)}
-        for kind, letter, count in (("input", "u", m), ("output", "y", l)):
-            names = tuple(getattr(self, f"{kind}s")) or numbered_names(letter, count)
-            units = tuple(getattr(self, f"{kind}_units")) or ("",) * len(names)
-            if len(names) != count or len(units) != count:
-                raise StructureError(f"{len(names)} names and {len(units)} units for {count} {kind}s.")
-            check_texts(f"the name of an {kind}", map(str, names), StructureError)
-            check_texts(f"the unit of an {kind}", map(str, units), StructureError)
-            fixed |= {f"{kind}s": names, f"{kind}_units": units}
+        fixed = {**fields, "nonlinearities": tuple(fields["nonlinearities"]), "dt": float(self.dt),
+                 **named_channels(self, m, l)}
         if self.levels is not None:
             fixed["levels"] = finite(self.levels, "levels")
             if fixed["levels"].ndim != 2 or not len(fixed["levels"]) or fixed["levels"].shape[1] != l:
@@ -139,6 +130,14 @@ class Model(Ports):
         near = (np.abs(self.poles - 1) <= distance) & (np.abs(self.poles.imag) <= ROUNDING)
         return 0 < int(near.sum()) <= self.l and bool(np.all(np.abs(self.poles[~near]) < 1 - ROUNDING))
 
+    def impulse_response(self, n: int = 100) -> Array:
+        """Return the response of the linear part to a unit impulse of every f, (n, l, r), in the gauge of the model."""
+        return impulse_response(*export.state_space(self), n)
+
+    def frequency_response(self, w: ArrayLike) -> Array:
+        """Return that of the linear part at the frequencies w (radians per unit of time), complex (len(w), l, r)."""
+        return frequency_response(*export.state_space(self), w, self.dt)
+
     def step_response(self, n: int = 100) -> Array:
         """Return the response of the linear part to a unit step of every f, (n, l, r), in the gauge of the model."""
         return np.cumsum(self.impulse_response(n), axis=0)
@@ -157,15 +156,8 @@ class Model(Ports):
         Raises:
             StructureError: u0 of the wrong size, an integrator (a pole at 1), or no equilibrium found.
         """
-        gain = self._static_gain(self._operating_point(u0))
+        gain = self._static_gain(operating_point(self, u0))
         return float(gain[0, 0]) if gain.size == 1 else gain
-
-    def _operating_point(self, u0: ArrayLike) -> Array:
-        """Read constant inputs (m,); refuse another number of them (`StructureError`)."""
-        points = np.atleast_1d(np.asarray(u0, dtype=float))
-        if points.shape != (self.m,):
-            raise StructureError(f"u0 has shape {points.shape}; it must be ({self.m},), one operating point per input.")
-        return points
 
     def __repr__(self) -> str:
         orders = ", ".join(f"{name}={value}" for name, value in self.orders.items())
@@ -237,6 +229,9 @@ class Model(Ports):
                 state = self._fitted("predict", inputs, outputs, label)
             prediction[first:last] = self._predicted(inputs, outputs, horizon, state, label)
         return prediction
+
+    def _predicted(self, u: Array, y: Array, horizon: int, state: Array, label: str) -> Array:
+        return self._run("free", [(u, y, label)], state)[0]  # without a noise model nothing else is known
 
     def simulate(self, data: Any, x0: Any = "zero") -> Any:
         """Compute the outputs from the inputs alone; nonlinear feedback sees the model's own outputs (P3).
@@ -333,6 +328,9 @@ class Model(Ports):
             raise StructureError("gauge 'gain' is defined for one output; use 'norm'.")
         return self._regauged(gauge, signs)
 
+    def _regauged(self, gauge: str, signs: bool) -> Self:
+        return self
+
     def with_transform(self, transform: Transform) -> Self:
         """Return the model in raw units, given that this one was identified on data changed by `transform`.
 
@@ -379,31 +377,6 @@ class Model(Ports):
         """
         return files.write(self.to_dict() | ({"record": dict(record)} if record else {}), path, files.FORMAT,
                            files.VERSION)
-
-
-def impulse_response(A: Array, B: Array, C: Array, D: Array, n: int) -> Array:
-    """Return D, C B, C A B, ..., (n, l, r)."""
-    response, x = np.zeros((n, len(C), B.shape[1])), B
-    response[:1] = D
-    with np.errstate(all="ignore"):
-        for k in range(1, n):
-            response[k] = C @ x
-            x = A @ x
-    return response
-
-
-def frequency_response(A: Array, B: Array, C: Array, D: Array, w: ArrayLike, dt: float) -> Array:
-    """Return C (zI - A)^-1 B + D at the frequencies w (radians per unit of time), complex (len(w), l, r)."""
-    z = np.exp(1j * np.atleast_1d(np.asarray(w, dtype=float)) * dt)
-    resolvent = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B.astype(complex))
-    return np.asarray(C @ resolvent + D)
-
-
-def static_solution(matrix: Array, right: Array) -> Array:
-    """Solve the equations of a steady state; refuse those of an integrator, which are singular (`StructureError`)."""
-    if matrix.size and np.linalg.svd(matrix, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(matrix).max()):
-        raise StructureError("The model has a pole at 1 (an integrator): it has no static gain.")
-    return np.asarray(np.linalg.solve(matrix, right), dtype=float)
 
 
 def _in_json(value: Any) -> Any:

@@ -7,15 +7,15 @@ from typing import Any, ClassVar, Self
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.linalg import expm
 from scipy.optimize import least_squares, root
 
 from optid.arrays import Array, finite
 from optid.data.channels import check_texts
 from optid.errors import DataError, StructureError
 from optid.models.experiments import Record, check_inputs, signal_units
-from optid.models.model import Model, frequency_response, impulse_response, static_solution
+from optid.models.held_inputs import held_step
+from optid.models.linear import static_solution
+from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_simulation import allowed_range
 
@@ -60,6 +60,7 @@ class PhysicalModel(Model):
     SIMULATORS = ("free", "predict")
     nonlinearities: ClassVar[tuple[Nonlinearity, ...]] = ()
     structure = "physical"
+    title = "Physical model"  # pyright: ignore[reportAssignmentType]
     memory = 0
     c0 = None
     offset_note = ""
@@ -72,11 +73,6 @@ class PhysicalModel(Model):
                  "parameters": {name: float(value) for name, value in self.parameters.items()}, "bounds": bounds}
         check_texts("the name of a state or parameter", map(str, (*names["states"], *self.parameters)), StructureError)
         self._fix({**given, **names}, len(self.inputs), len(self.outputs))
-
-    @property
-    def title(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What kind of model this is."""
-        return "Physical model"
 
     @property
     def nx(self) -> int:
@@ -100,11 +96,9 @@ class PhysicalModel(Model):
 
     def _linear(self, x: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """A, B, C, D of one sampling time about a state and inputs."""
-        n = self.nx
         a, b, c, d = (np.array(one) for one in self.runs.slopes(x, u, self.p))
         if self.steps:
-            both = expm(self.dt * np.vstack([np.hstack([a, b]), np.zeros((self.m, n + self.m))]))
-            a, b = both[:n, :n], both[:n, n:]
+            a, b = held_step(a, b, self.dt)
         return a, b, c, d
 
     @cached_property
@@ -120,14 +114,6 @@ class PhysicalModel(Model):
         """Poles (n,) about `point`, largest first."""
         values: Any = np.linalg.eigvals(self.matrices[0])
         return values[np.argsort(-np.abs(values), kind="stable")]
-
-    def impulse_response(self, n: int = 100) -> Array:
-        """Return the impulse response (n, l, m) of the linear part about `point`."""
-        return impulse_response(*self.matrices, n)
-
-    def frequency_response(self, w: ArrayLike) -> Any:
-        """Return that of the linear part about `point` at w (radians per unit of time), complex (len(w), l, m)."""
-        return frequency_response(*self.matrices, w, self.dt)
 
     def _static_gain(self, u0: Array) -> Array:
         a, b, c, d = self._linear(self.rest(u0), u0)
@@ -164,9 +150,6 @@ class PhysicalModel(Model):
     @property
     def _state_shape(self) -> tuple[int]:
         return (self.nx,)
-
-    def _predicted(self, u: Array, y: Array, horizon: int, state: Array, label: str) -> Array:
-        return self._run("free", [(u, y, label)], state)[0]  # without a noise model nothing else is known
 
     def _run(self, simulator: str, records: Sequence[Record], x0: Any) -> list[Array]:
         states = self._states(simulator, records, x0)
@@ -205,9 +188,6 @@ class PhysicalModel(Model):
         return solve(errors, start, slopes, bounds=(low, high), x_scale=size, xtol=1e-12, ftol=1e-12).x
 
     # -- gauge, units, files -------------------------------------------------------------------------------------
-
-    def _regauged(self, gauge: str, signs: bool) -> Self:
-        return self
 
     def with_transform(self, transform: Any) -> Self:
         """Return the model as it is: its equations are stated in raw units."""

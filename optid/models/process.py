@@ -9,23 +9,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from optid.arrays import Array, finite, one_or_all
-from optid.data.channels import Transform
+from optid.arrays import Array, finite, one_of, one_or_all
+from optid.data.channels import Ports, Transform
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.models.continuous import ContinuousModel
-from optid.models.experiments import Record, check_inputs, in_units_of, scaled_least_squares, state_like
+from optid.models.equations import HOLDS
+from optid.models.experiments import Record, check_inputs, in_units_of, scaled_least_squares
 from optid.models.functions import static_functions
 from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.process_dynamics import ProcessDynamics, ProcessStructure
 from optid.models.process_kernel import thin_out
+from optid.models.text import signed_terms
 
-HOLDS = ("zero", "first")
 
-
-def _is_regular(data: Any) -> bool:
-    return not isinstance(data, Data) or data.is_regular
+def name_of_pair(name: str, pair: tuple[int, int], ports: Ports) -> str:
+    """Name a quantity of a pair: plain with one input, ``name[input]`` with several, ``name[output,input]``."""
+    output, channel = ports.outputs[pair[0]], ports.inputs[pair[1]]
+    if ports.l > 1:
+        return f"{name}[{output},{channel}]"
+    return name if ports.m == 1 else f"{name}[{channel}]"
 
 
 def _of_samples(name: str) -> Any:
@@ -72,13 +76,13 @@ class ProcessModel(Model):
     SIMULATORS: ClassVar[tuple[str, ...]] = ("free", "predict")
     structure: ClassVar[str] = "process"  # pyright: ignore[reportIncompatibleVariableOverride]
     memory: ClassVar[int] = 0  # pyright: ignore[reportIncompatibleVariableOverride]
+    c0: ClassVar[None] = None  # pyright: ignore[reportIncompatibleVariableOverride]
     offset_note: ClassVar[str] = "the constant of f is part of the level"
 
     def __post_init__(self) -> None:
         if len(self.processes) != len(self.nonlinearities) or not self.processes:
             raise StructureError(f"{len(self.processes)} processes for {len(self.nonlinearities)} static curves")
-        if self.hold not in HOLDS:
-            raise StructureError(f"hold={self.hold!r} must be one of {', '.join(map(repr, HOLDS))}")
+        one_of("hold", self.hold, HOLDS)
         level = np.atleast_1d(finite(self.level, "level"))
         drift = np.broadcast_to(finite(self.drift, "drift"), level.shape)
         pairs = tuple((int(o), int(c)) for o, c in self.pairs) or tuple((0, c) for c in range(len(self.processes)))
@@ -95,11 +99,6 @@ class ProcessModel(Model):
     def input_of(self) -> tuple[int, ...]:
         """The input that every function acts on."""
         return tuple(c for _, c in self.pairs)
-
-    @property
-    def c0(self) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """No offset of f: it is part of the level."""
-        return None
 
     @property
     def title(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -128,11 +127,8 @@ class ProcessModel(Model):
         return np.array([one.dead_time for one in self.processes])
 
     def of_pair(self, name: str, number: int) -> str:
-        """Name a quantity of a pair."""
-        o, c = self.pairs[number]
-        if self.l > 1:
-            return f"{name}[{self.outputs[o]},{self.inputs[c]}]"
-        return name if self.m == 1 else f"{name}[{self.inputs[c]}]"
+        """Name a quantity of a pair; see `name_of_pair`."""
+        return name_of_pair(name, self.pairs[number], self)
 
     def _of_output(self, name: str, o: int) -> str:
         return name if self.l == 1 else f"{name}[{self.outputs[o]}]"
@@ -171,8 +167,7 @@ class ProcessModel(Model):
                 if to == o:
                     name = self.inputs[c]
                     terms.append(f"{one.equation()} {f'{f.mu[0]:.4g} {name}' if f.is_linear else f'{word}({name})'}")
-            rest = [(self.level[o], ""), *([(self.drift[o], " t")] if self.drift[o] else [])]
-            beside = "".join(f" {'-' if size < 0 else '+'} {abs(size):.4g}{of}" for size, of in rest)
+            beside = signed_terms([(self.level[o], ""), (self.drift[o], "t")])
             lines.append(f"{output} = {' + '.join(terms)}{beside}")
         return "\n".join(lines)
 
@@ -230,68 +225,60 @@ class ProcessModel(Model):
     def _scaled(self) -> tuple[ProcessDynamics, ...]:
         return tuple(one.in_unit(self.dt) for one in self.processes)
 
-    def respond(self, u: Array, instants: Array | None = None, read_at: Array | None = None) -> Array:
-        """Return the outputs (N, l) to inputs (J, m) from rest, at any instants; (N,) of a model with one output.
+    def respond(self, u: Array, instants: Array | None = None) -> Array:
+        """Return the outputs (N, l) to inputs (N, m) from rest, at any instants; (N,) of a model with one output.
 
         Args:
             u: inputs, none missing.
-            instants: (J,) times of the inputs, increasing; multiples of dt by default.
-            read_at: (N,) times of the outputs, not decreasing; those of the inputs by default.
+            instants: (N,) their times, increasing; multiples of dt by default.
         """
         t = np.arange(float(len(u))) if instants is None else np.asarray(instants, dtype=float) / self.dt
-        at = t if read_at is None else np.asarray(read_at, dtype=float) / self.dt
-        found, straight = self.level + self.drift * self.dt * (at - t[0])[:, None], self.hold == "first"
+        found, straight = self.level + self.drift * self.dt * (t - t[0])[:, None], self.hold == "first"
         for (o, c), one, f in zip(self.pairs, self._scaled, self.nonlinearities):
             changes, values = thin_out(t, f(u[:, c])[:, None], straight)
-            found[:, o] += one.response(at, changes, values - values[0], straight=straight)[:, 0, 0]
+            found[:, o] += one.response(t, changes, values - values[0], straight=straight)[:, 0, 0]
             found[:, o] += 0.0 if one.structure.integrator else values[0, 0]
         return found[:, 0] if self.l == 1 else found
 
-    def _motion(self, count: int, stamps: Array | None = None) -> Array:
-        """Return the free motion (N, l, n) of every entry of a state: sections pair by pair, then levels."""
-        t = np.arange(float(count)) if stamps is None else stamps / self.dt
+    def _courses(self, u: Array, label: str, stamps: Array | None = None) -> tuple[Array, Array]:
+        """Return the outputs (N, l) to inputs from rest, and the free motion (N, l, n) of every entry of a state.
+
+        The entries are the sections pair by pair, then levels.
+        """
+        check_inputs(self, u, label)
+        t = np.arange(float(len(u))) if stamps is None else stamps / self.dt
         each = [one.free_response(t, 0.0) for one in self._scaled]
         outputs = np.repeat([o for o, _ in self.pairs], [one.shape[1] for one in each])
-        found = np.hstack(each)[:, None, :] * np.equal.outer(np.arange(self.l), outputs)
-        if self.levels is None:
-            return found
-        return np.concatenate([found, np.broadcast_to(np.eye(self.l), (count, self.l, self.l))], axis=2)
+        motion = np.hstack(each)[:, None, :] * np.equal.outer(np.arange(self.l), outputs)
+        if self.levels is not None:
+            motion = np.concatenate([motion, np.broadcast_to(np.eye(self.l), (len(u), self.l, self.l))], axis=2)
+        return self.respond(u, stamps).reshape(len(u), self.l), motion
 
     def simulate(self, data: Any, x0: Any = "zero") -> Any:
         """Compute the outputs from the inputs alone, at the times of the record; arguments as of `Model.simulate`."""
-        return super().simulate(data, x0) if _is_regular(data) else self._at_stamps(data, x0)
+        return self._at_times(data, x0) if isinstance(data, Data) else super().simulate(data, x0)
 
     def predict(self, data: Data, horizon: int = 1, x0: Any = "fit") -> Any:
         """Predict as `Model.predict`: without a noise model nothing but the initial state is learnt from outputs."""
-        return super().predict(data, horizon, x0) if _is_regular(data) else self._at_stamps(data, x0)
+        return super().predict(data, horizon, x0) if data.is_regular else self._at_times(data, x0)
 
-    def _at_stamps(self, data: Data, x0: Any) -> Any:
-        """Run over a record at irregular times."""
-        records, found = in_units_of(self, data).experiments, []
-        given = [None] * len(records) if isinstance(x0, str) else list(x0) if len(records) > 1 else [x0]
-        for i, (e, state) in enumerate(zip(records, given), start=1):
-            label = f"Experiment {i}: " * (len(records) > 1)
-            check_inputs(self, e.u, label)
-            y, motion = self.respond(e.u, e.stamps).reshape(e.y.shape), self._motion(len(e.u), e.stamps)
-            if state is not None or x0 != "zero":
-                start = self._least(motion, e.y - y, label) if state is None else state_like(state, self._state_shape)
-                y = y + motion @ start
-            found.append(y)
-        return one_or_all(found)
+    def _at_times(self, data: Data, x0: Any) -> Any:
+        parts = in_units_of(self, data).experiments
+        records = [(e.u, e.y, f"Experiment {i}: " * (len(parts) > 1)) for i, e in enumerate(parts, start=1)]
+        return one_or_all(self._run("free", records, x0, [e.stamps for e in parts]))
 
-    def _run(self, simulator: str, records: Sequence[Record], x0: Any) -> list[Array]:
+    def _run(self, simulator: str, records: Sequence[Record], x0: Any, stamps: Sequence[Any] = ()) -> list[Array]:
+        fit = isinstance(x0, str) and x0 == "fit" and all(y is not None for _, y, _ in records)
+        states = [None] * len(records) if fit else self._states(simulator, records, x0)
         found = []
-        for (u, _, label), state in zip(records, self._states(simulator, records, x0)):
-            check_inputs(self, u, label)
-            found.append(self.respond(u).reshape(len(u), self.l) + self._motion(len(u)) @ state)
+        for (u, y, label), state, times in zip(records, states, stamps or [None] * len(records)):
+            own, motion = self._courses(u, label, times)
+            found.append(own + motion @ (self._least(motion, y - own, label) if state is None else state))
         return found
 
-    def _predicted(self, u: Array, y: Array, horizon: int, state: Array, label: str) -> Array:
-        return self._run("free", [(u, y, label)], state)[0]  # without a noise model nothing else is known
-
     def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:
-        check_inputs(self, u, label)
-        return self._least(self._motion(len(u)), y - self.respond(u).reshape(y.shape), label)
+        own, motion = self._courses(u, label)
+        return self._least(motion, y - own, label)
 
     def _least(self, motion: Array, rest: Array, label: str) -> Array:
         """Return the state whose motion (N, l, n) explains most of a rest (N, l)."""
@@ -340,9 +327,6 @@ class ProcessModel(Model):
         return self.to_continuous().to_control(pade)
 
     # -- gauge, units, files -------------------------------------------------------------------------------------------
-
-    def _regauged(self, gauge: str, signs: bool) -> Self:
-        return self
 
     def _in_raw_units(self, transform: Transform) -> Self:
         sizes, curves = np.array(transform.y_scale), []

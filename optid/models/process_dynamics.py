@@ -174,12 +174,6 @@ class ProcessDynamics:
         f, row = self._chain
         return f[2:, 2:], f[2:, 0], row[2:], float(row[0])
 
-    @property
-    def plain(self) -> tuple[Array, Array]:
-        """System (F, C) that reads the output alone; see `process_kernel.run`."""
-        f, row = self._chain
-        return f, row[None]
-
     @cached_property
     def sensitive(self) -> tuple[Array, Array]:
         """System (F, C) that reads the output and its derivatives by all parameters, C (1 + k, n)."""
@@ -221,15 +215,15 @@ class ProcessDynamics:
             late: whether a delayed change of the input that falls on an instant belongs to the slope there.
             sensitive: whether the derivatives by all parameters are returned, too.
         """
-        f, c = self.sensitive if sensitive else self.plain
-        return run(f, c, instants, changes + self.dead_time, np.ascontiguousarray(inputs),
+        f, c = self.sensitive if sensitive else self._chain
+        return run(f, np.atleast_2d(c), instants, changes + self.dead_time, np.ascontiguousarray(inputs),
                    (straight, late), np.zeros((len(f), inputs.shape[1])))
 
     def free_response(self, instants: Array, first: float) -> Array:
         """Return the responses (N, n) of the output to unit states of all sections at a first time, without input."""
-        (f, c), n = self.plain, self.structure.order
+        (f, row), n = self._chain, self.structure.order
         start = np.vstack([np.zeros((2, n)), np.eye(n)])
-        return run(f, c, instants, np.array([first]), np.zeros((1, n)), (False, True), start)[:, 0]
+        return run(f, row[None], instants, np.array([first]), np.zeros((1, n)), (False, True), start)[:, 0]
 
     def transfer(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return G(s) exp(-theta s) at complex s."""
@@ -286,12 +280,12 @@ def read_structures(process: Any, inputs: Sequence[str], outputs: Sequence[str] 
     One type is that of all pairs, one per input that of every output; rows may follow one another in one list
     (`StructureError`: other numbers of them, an output without any process).
     """
-    several = isinstance(process, list | tuple)
-    if several and len(process) == len(inputs) * len(outputs) and all(word is None or isinstance(
-            word, str | ProcessStructure) for word in process):
-        process = [process[i : i + len(inputs)] for i in range(0, len(process), len(inputs))]
-    rows = list(process) if several and any(isinstance(row, list | tuple) for row in process) else (
-        [process] * len(outputs))
+    rows = [process] * len(outputs)
+    if isinstance(process, list | tuple):
+        if any(isinstance(row, list | tuple) for row in process):
+            rows = list(process)
+        elif len(process) == len(inputs) * len(outputs):
+            rows = [process[i : i + len(inputs)] for i in range(0, len(process), len(inputs))]
     if len(rows) != len(outputs):
         raise StructureError(f"process has {len(rows)} rows for {len(outputs)} outputs ({', '.join(outputs)}): one row "
                              "of types per output, one type per input")

@@ -16,63 +16,45 @@ REACH = 4.0  # norm of F h up to which the series is applied to the state itself
 TERMS = 24  # of a series, at most, for a norm of one
 
 
-@cached_njit
-def _product(left, right, into):
-    """Multiply square matrices."""
-    n = len(left)
-    for i in range(n):
-        for j in range(n):
-            into[i, j] = 0.0
-        for k in range(n):
-            if left[i, k] != 0.0:
-                for j in range(n):
-                    into[i, j] += left[i, k] * right[k, j]
+@cached_njit(inline="always")  # a call counts references to its arrays, which takes as long as the product
+def _multiply(left, right, into):
+    """Write the product of two matrices; many entries of the left one are zero."""
+    for i in range(left.shape[0]):
+        for c in range(right.shape[1]):
+            total = 0.0
+            for k in range(right.shape[0]):
+                if left[i, k] != 0.0:
+                    total += left[i, k] * right[k, c]
+            into[i, c] = total
+
+
+@cached_njit(inline="always")
+def _copy(matrix, into):
+    for i in range(matrix.shape[0]):
+        for c in range(matrix.shape[1]):
+            into[i, c] = matrix[i, c]
 
 
 @cached_njit
-def exponential(F, h, found):  # noqa: N803 - the field's letter
+def _exponential(F, h, norm, found):  # noqa: N803 - the field's letter
     """Write exp(F h), found by scaling, a Taylor series and squaring."""
-    n = len(F)
-    size = 0.0
-    for i in range(n):
-        row = 0.0
-        for j in range(n):
-            row += abs(F[i, j])
-        size = max(size, row * h)
     doublings = 0
-    while size > 0.5:
-        size /= 2.0
+    while norm * h > 0.5 * 2.0**doublings:
         doublings += 1
-    part = h / 2.0**doublings
+    n, part = len(F), h / 2.0**doublings
     term, following = np.zeros((n, n)), np.zeros((n, n))
     for i in range(n):
         for j in range(n):
             term[i, j] = found[i, j] = 1.0 if i == j else 0.0
     for order in range(1, 18):
-        _product(F, term, following)
+        _multiply(F, term, following)
         for i in range(n):
             for j in range(n):
                 term[i, j] = following[i, j] * (part / order)
                 found[i, j] += term[i, j]
     for _ in range(doublings):
-        _product(found, found, following)
-        for i in range(n):
-            for j in range(n):
-                found[i, j] = following[i, j]
-
-
-@cached_njit
-def _apply(E, z, into):  # noqa: N803
-    n, m = z.shape
-    for i in range(n):
-        for c in range(m):
-            total = 0.0
-            for k in range(n):
-                total += E[i, k] * z[k, c]
-            into[i, c] = total
-    for i in range(n):
-        for c in range(m):
-            z[i, c] = into[i, c]
+        _multiply(found, found, following)
+        _copy(following, found)
 
 
 @cached_njit
@@ -82,26 +64,33 @@ def _series(F, h, norm, z, term, into):  # noqa: N803
     steps = max(1, int(np.ceil(norm * h)))
     g = h / steps
     for _ in range(steps):
-        for i in range(n):
-            for c in range(m):
-                term[i, c] = z[i, c]
+        _copy(z, term)
         for order in range(1, TERMS):
+            _multiply(F, term, into)
             largest, reached = 0.0, 0.0
             for i in range(n):
                 for c in range(m):
-                    total = 0.0
-                    for k in range(n):
-                        if F[i, k] != 0.0:
-                            total += F[i, k] * term[k, c]
-                    into[i, c] = total * (g / order)
-            for i in range(n):
-                for c in range(m):
-                    term[i, c] = into[i, c]
-                    z[i, c] += into[i, c]
-                    largest = max(largest, abs(into[i, c]))
+                    term[i, c] = into[i, c] * (g / order)
+                    z[i, c] += term[i, c]
+                    largest = max(largest, abs(term[i, c]))
                     reached = max(reached, abs(z[i, c]))
             if largest <= 1e-18 * reached:
                 break
+
+
+@cached_njit
+def _place(lengths, h, close):
+    """Return where a length is among others, -1 where it is not."""
+    for one in range(len(lengths)):
+        if abs(lengths[one] - h) <= close:
+            return one
+    return -1
+
+
+@cached_njit
+def _is_before(instant, change, close, late):
+    """Whether a change does not act yet at an instant; one that is not late acts right after its own instant."""
+    return instant < change - close or (not late and instant <= change + close)
 
 
 @cached_njit
@@ -137,7 +126,7 @@ def run(F, C, instants, changes, inputs, sides, start):  # noqa: N803
         largest = max(largest, abs(changes[0]), abs(changes[-1]))
     close = 1e-15 * largest  # a few times the rounding of a difference of two times
     k = 0
-    while k < count and (instants[k] < changes[0] - close or (not late and instants[k] <= changes[0] + close)):
+    while k < count and _is_before(instants[k], changes[0], close, late):
         k += 1
     for j in range(len(changes)):
         now, last = changes[j], j + 1 == len(changes)
@@ -147,41 +136,27 @@ def run(F, C, instants, changes, inputs, sides, start):  # noqa: N803
             if straight and not last:
                 z[1, c] = (inputs[j + 1, c] - inputs[j, c]) / (changes[j + 1] - changes[j])
         while True:
-            reads = k < count and (last or instants[k] < changes[j + 1] - close or (
-                not late and instants[k] <= changes[j + 1] + close))
+            reads = k < count and (last or _is_before(instants[k], changes[j + 1], close, late))
             if not reads and (last or k == count):
                 break
             to = instants[k] if reads else changes[j + 1]
             h = to - now
             if h > close:
-                slot = -1
-                for one in range(SLOTS):
-                    if abs(lengths[one] - h) <= close:
-                        slot = one
-                        break
-                if slot < 0:
-                    again = norm * h > REACH
-                    for one in range(SLOTS):
-                        again = again or abs(recent[one] - h) <= close
-                    if again:
-                        slot, used = used, (used + 1) % SLOTS
-                        exponential(F, h, kept[slot])
-                        lengths[slot] = h
-                    else:
-                        recent[noted], noted = h, (noted + 1) % SLOTS
+                slot = _place(lengths, h, close)
+                if slot < 0 and (norm * h > REACH or _place(recent, h, close) >= 0):
+                    slot, used = used, (used + 1) % SLOTS
+                    _exponential(F, h, norm, kept[slot])
+                    lengths[slot] = h
                 if slot >= 0:
-                    _apply(kept[slot], z, into)
+                    _multiply(kept[slot], z, into)
+                    _copy(into, z)
                 else:
+                    recent[noted], noted = h, (noted + 1) % SLOTS
                     _series(F, h, norm, z, term, into)
                 now = to
             if not reads:
                 break
-            for o in range(outputs):
-                for c in range(m):
-                    total = 0.0
-                    for i in range(n):
-                        total += C[o, i] * z[i, c]
-                    out[k, o, c] = total
+            _multiply(C, z, out[k])
             k += 1
     return out
 

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag, solve_discrete_lyapunov
+from scipy.linalg import block_diag
 
 from optid.arrays import Array, finite
 from optid.bases import Linear
@@ -15,10 +15,12 @@ from optid.data.channels import Transform
 from optid.errors import StructureError
 from optid.models import roots
 from optid.models.equilibria import equilibria
+from optid.models.experiments import operating_point
 from optid.models.feedback_tables import tabulate
 from optid.models.gauges import plant_signs
 from optid.models.kalman import NoiseCovariances
-from optid.models.model import Model, frequency_response, impulse_response, static_solution
+from optid.models.linear import balancing, impulse_response, static_solution
+from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_signals import Parts
 
@@ -177,14 +179,6 @@ class StateSpace(Model):
         """Eigenvalues of A, complex (n,), largest first: the poles with the feedback g and L taken as given signals."""
         return roots.largest_first(np.linalg.eigvals(self.A).astype(complex))
 
-    def impulse_response(self, n: int = 100) -> Array:
-        """Return the response of (A, B, C, D) to a unit impulse of every f, (n, l, r), in the gauge of the model."""
-        return impulse_response(self.A, self.B, self.C, self.D, n)
-
-    def frequency_response(self, w: ArrayLike) -> Array:
-        """Return C (zI - A)^-1 B + D at the frequencies w (radians per unit of time), complex (len(w), l, r)."""
-        return frequency_response(self.A, self.B, self.C, self.D, w, self.dt)
-
     def equilibrium(self, u0: ArrayLike, near: ArrayLike | None = None) -> tuple[Array, Array]:
         """Return a state (n,) and outputs (l,) at which the model rests under constant inputs u0 (m,).
 
@@ -194,7 +188,7 @@ class StateSpace(Model):
         Raises:
             StructureError: u0 of the wrong size, a pole at 1, or no equilibrium found.
         """
-        u = self._operating_point(u0)[None]
+        u = operating_point(self, u0)[None]
         x, y = equilibria(self, self.expand_inputs(u), u, None if near is None else np.reshape(near, (1, self.nx)))
         return x[0], y[0]
 
@@ -209,14 +203,13 @@ class StateSpace(Model):
             f[:, j] = self.nonlinearities[j](points)
         return equilibria(self, f, u)[1]
 
-    def _static_gain(self, points: Array) -> Array:
-        return self.gain_at_rest(points)
-
     def gain_at_rest(self, u0: Array, near: ArrayLike | None = None) -> Array:
         """Return the slope (l, m) of the steady-state characteristic at an equilibrium; arguments as `equilibrium`."""
         x, y = self.equilibrium(u0, near)
         A, B, C, D = (one[0] for one in self.tangent(x[None], y[None], u0[None]))
         return D - C @ static_solution(A - np.eye(self.nx), B)
+
+    _static_gain = gain_at_rest
 
     def tangent(self, x: Array, y: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """Return A, B, C, D of the free run near states (N, n), outputs (N, l) and inputs (N, m), N of each."""
@@ -267,22 +260,6 @@ class StateSpace(Model):
         """
         return self if self.nx == 0 else self.transform(
             balancing(self.A, np.hstack([self.B, self.E, self.Ez]), np.vstack([self.C, self.Cz])))
-
-    def inject_output(self, gain: ArrayLike) -> Self:
-        """Move gain times the output out of A into L: A - gain C, L + gain, K - gain.
-
-        P1 and P3 do not change; P2 does, since it feeds back the measured output. With a gain (n, l) of -L the
-        injection is absorbed into A.
-        """
-        if self.levels is not None:
-            raise StructureError("A model with levels feeds back no output, whose zero would act: choose a level by "
-                                 "at_level first.")
-        moved = np.asarray(gain, dtype=float)
-        if moved.shape != self.L.shape:
-            raise StructureError(f"The gain has shape {moved.shape}; it must be {self.L.shape}.")
-        return replace(
-            self, A=self.A - moved @ self.C, B=self.B - moved @ self.D, L=self.L + moved, K=self.K - moved,
-            Ez=self.Ez - moved @ self.Fz, offset_x=self.offset_x - moved @ self.offset_y, noise=None, gauge="none")
 
     def _regauged(self, gauge: str, signs: bool) -> Self:
         if gauge == "gain":
@@ -398,27 +375,3 @@ def _shapes(*sizes: int) -> dict[str, tuple[int, ...]]:
     """Shapes of the matrices for n, m, l, r, s and k."""
     size = dict(zip("nmlrsk", sizes))
     return {name: tuple(size[letter] for letter in letters) for name, letters in (MATRICES | COVARIANCES).items()}
-
-
-def balancing(A: Array, B: Array, C: Array) -> Array:
-    """Return the change of states T (n, n) that makes both Gramians of (A, B, C) diagonal and equal.
-
-    Raises:
-        StructureError: A is unstable, or the triple is not minimal.
-    """
-    largest = roots.spectral_radius(A)
-    if largest >= 1:
-        raise StructureError(f"The model is unstable (largest pole {largest:.6g}): it has no Gramians.")
-    reach = _root(solve_discrete_lyapunov(A, B @ B.T))
-    see = _root(solve_discrete_lyapunov(A.T, C.T @ C))
-    left, values, right = np.linalg.svd(see.T @ reach)
-    if values[-1] <= 1e-13 * values[0]:
-        raise StructureError(
-            f"The model is not minimal: its Hankel singular values fall from {values[0]:.3g} to {values[-1]:.3g}. "
-            "Identify it with fewer states.")
-    return (left / np.sqrt(values)).T @ see.T
-
-
-def _root(gramian: Array) -> Array:
-    values, vectors = np.linalg.eigh((gramian + gramian.T) / 2)
-    return vectors * np.sqrt(np.maximum(values, 0.0))

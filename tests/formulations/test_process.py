@@ -8,14 +8,16 @@ import pytest
 from refusals import refuses
 from scipy import stats
 from scipy.optimize import minimize, nnls
+from typer.testing import CliRunner
 
 import optid
 from formulations.constraints import process as words
+from optid.cli.app import app
 from optid.errors import DataError, InfeasibleError, RankError, StructureError
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.order import choose_type
 from optid.identify.process.proof import BranchAndBound
-from optid.identify.process.record import Terms, process_errors
+from optid.identify.process.record import process_errors
 from optid.identify.process.starts import usual_box
 from optid.identify.process.step_courses import step_of_two
 from optid.models.process import ProcessModel, process_model
@@ -40,6 +42,13 @@ def fit(data: optid.Data, process: str = "P1D", **options) -> optid.Fit:
 
 def estimates(found: optid.Fit) -> dict[str, float]:
     return dict(found.model.coefficients())
+
+
+def is_near(found: optid.Fit, truth: dict[str, float], errors: float = 4) -> None:
+    """Assert that estimates are within so many of their standard errors of the truth."""
+    for name, value in truth.items():
+        row = found.params[name]
+        assert abs(row.estimate - value) < errors * row.error, name
 
 
 # -- what a fit returns --------------------------------------------------------------------------------------------
@@ -96,12 +105,9 @@ def test_integrators(process):
     values = {"dead_time": 12.4, **({"tau": 9.0} if process == "P1DI" else {})}
     truth = process_model(process, K=0.05, level=5.0, **values)
     found = fit(record(truth, ((T >= 10) & (T < 60)) * 1.0, 0.01), process)
-    for name, value in {**values, "K": 0.05}.items():
-        row = found.params[name]
-        assert abs(row.estimate - value) < 4 * row.error, name
+    is_near(found, {**values, "K": 0.05})
     assert found.dynamics["slope"].estimate == pytest.approx(found.params["K"].estimate)
-    with pytest.raises(StructureError, match="integrator"):
-        found.model.static_gain(0.5)
+    refuses(StructureError, "integrator", found.model.static_gain, 0.5)
 
 
 def test_two_inputs_two_experiments_and_labels():
@@ -112,23 +118,20 @@ def test_two_inputs_two_experiments_and_labels():
     ys = [valve.respond(u[:, :1]) + heater.respond(u[:, 1:]) + 3 + 0.05 * rng.normal(size=200) for u in us]
     data = optid.Data(us, ys, dt=1.0, inputs=["valve", "heater"])
     found = fit(data, ["P1D", "P2DU"])
-    truth = {"K[valve]": 2, "tau[valve]": 20, "dead_time[valve]": 6.3, "K[heater]": -1, "T[heater]": 8,
-             "zeta[heater]": 0.4, "dead_time[heater]": 2.7, "level": 3}
-    for name, value in truth.items():
-        assert abs(found.params[name].estimate - value) < 4 * found.params[name].error, name
+    is_near(found, {"K[valve]": 2, "tau[valve]": 20, "dead_time[valve]": 6.3, "K[heater]": -1, "T[heater]": 8,
+                    "zeta[heater]": 0.4, "dead_time[heater]": 2.7, "level": 3})
     held = fit(data, ["P1D", "P2DU"], constraints=["tau:20,channel=valve"])
     assert estimates(held)["tau[valve]"] == pytest.approx(20.0)
 
 
 def test_a_motion_before_the_record_has_a_state_of_its_own():
-    model = process_model("P1D", K=2.0, tau=30.0, dead_time=12.4, level=5.0)
-    moving = record(model).y[:, 0] + 1.5 * np.exp(-T / 30)
+    moving = record().y[:, 0] + 1.5 * np.exp(-T / 30)
     data = optid.Data(STEP, moving, dt=1.0)
     free = fit(data, initial="free")
     with pytest.warns(optid.errors.DataWarning, match="does not begin at rest"):
         rest = fit(data)
     assert rest.figures["start"].startswith("not at rest")
-    assert abs(free.params["tau"].estimate - 30) < 4 * free.params["tau"].error
+    is_near(free, {"tau": 30})
     assert free.solution.objective < 0.5 * rest.solution.objective
 
 
@@ -136,7 +139,7 @@ def test_levels_of_experiments():
     ys = [record(seed=i).y[:, 0] + 10 * i for i in range(2)]
     data = optid.Data([STEP, STEP], ys, dt=1.0)
     found = fit(data, offset="each")
-    assert abs(found.params["tau"].estimate - 30) < 4 * found.params["tau"].error
+    is_near(found, {"tau": 30})
     np.testing.assert_allclose(found.model.levels[:, 0], [5, 15], atol=0.1)
     assert found.solution.proof
 
@@ -148,8 +151,7 @@ def test_irregular_instants_and_gaps():
     y = FIRST.respond(u[:, None], instants=t) + 0.04 * rng.normal(size=200)
     y[40:55] = y[90:120] = np.nan
     found, regular = fit(optid.Data(u, y, dt=1.0, times=t)), fit(optid.Data(u, y, dt=1.0))
-    for name, value in {"K": 2, "tau": 30, "dead_time": 12.4}.items():
-        assert abs(found.params[name].estimate - value) < 4 * found.params[name].error, name
+    is_near(found, {"K": 2, "tau": 30, "dead_time": 12.4})
     assert found.solution.proof and estimates(found) != estimates(regular)
 
 
@@ -160,8 +162,8 @@ def test_straight_inputs_are_exact():
     found = fit(optid.Data(ramp, y + 1e-7 * np.random.default_rng(0).normal(size=200), dt=1.0), hold="first")
     assert estimates(found)["dead_time"] == pytest.approx(12.4, abs=1e-4)
     assert found.model.hold == "first"
-    with pytest.raises(StructureError, match="straight static curves"):
-        fit(optid.Data(ramp, y, dt=1.0), hold="first", basis="triangular:4")
+    refuses(StructureError, "straight static curves", fit, optid.Data(ramp, y, dt=1.0), hold="first",
+            basis="triangular:4")
 
 
 def staircase(seed: int = 5, hold: int = 25) -> np.ndarray:
@@ -177,7 +179,7 @@ def test_static_curve_with_words():
         warnings.simplefilter("ignore", optid.errors.DataWarning)
         free = fit(data, basis="triangular:9")
         flat = fit(data, basis="triangular:9", constraints=["monotone:increasing"])
-    assert abs(free.params["dead_time"].estimate - 3.3) < 4 * free.params["dead_time"].error
+    is_near(free, {"dead_time": 3.3})
     curve = flat.model.nonlinearities[0](np.linspace(-1, 1, 50))
     assert np.all(np.diff(curve) >= -1e-9) and flat.solution.objective >= free.solution.objective
     assert not free.solution.proof and "real poles" in free.solution.bound.reason
@@ -197,8 +199,7 @@ def test_a_model_is_saved_loaded_and_simulated(tmp_path):
 def test_simulation_fits_its_initial_state():
     moving = FIRST.respond(STEP[:, None]) + 1.5 * np.exp(-T / 30)
     data = optid.Data(STEP, moving, dt=1.0)
-    state = FIRST.initial_state(data)
-    np.testing.assert_allclose(FIRST.simulate(data, x0=state)[:, 0], moving, atol=1e-10)
+    np.testing.assert_allclose(FIRST.simulate(data, x0=FIRST.initial_state(data))[:, 0], moving, atol=1e-10)
 
 
 def test_responses_of_the_model():
@@ -209,11 +210,7 @@ def test_responses_of_the_model():
     s = 0.2j
     assert model.frequency_response(0.2)[0, 0, 0] == pytest.approx(np.exp(-12 * s) / (30 * s + 1))
     assert model.static_gain(0.3) == 2.0 and model.is_stable and not model.integrates
-
-
-def test_time_constants_are_sorted():
-    model = process_model("P2", tau1=3.0, tau2=20.0)
-    assert model.processes[0].p.tolist() == [20.0, 3.0]
+    assert process_model("P2", tau1=3.0, tau2=20.0).processes[0].p.tolist() == [20.0, 3.0]  # the largest first
 
 
 def test_poles_and_zero_may_be_named_instead_of_a_type():
@@ -258,20 +255,17 @@ def test_a_known_gain_sharpens_the_time_constant():
     assert fit(data, constraints=["gain:2"]).params["tau"].error < 0.3 * fit(data).params["tau"].error
 
 
-def test_bounds_are_part_of_the_proof():
+def test_bounds_are_part_of_the_proof_unless_they_contradict_each_other():
     found = fit(record(), constraints=["tau:high=25", "dead_time:low=14"])
     assert found.solution.proof and found.solution.status is Status.OPTIMAL
-
-
-def test_contradictory_words_are_infeasible():
-    with pytest.raises(InfeasibleError, match="tau"):
-        fit(record(), constraints=[words.tau(high=10).with_name("below"), words.tau(low=20).with_name("tau above")])
+    refuses(InfeasibleError, "tau", fit, record(), constraints=[
+        words.tau(high=10).with_name("below"), words.tau(low=20).with_name("tau above")])
 
 
 @pytest.mark.parametrize("word", ["tau:high=60", "dead_time:12", "overdamped", "zeta:0.5", "K:2"])
 def test_other_formulations_refuse_the_words_by_name(word):
-    with pytest.raises(StructureError, match=rf"'{word.split(':')[0]}'.*process.exact"):
-        optid.fit(record(), "oe.exact", na=1, nb=1, nk=13, constraints=[word])
+    refuses(StructureError, rf"'{word.split(':')[0]}'.*process.exact", optid.fit, record(), "oe.exact", na=1, nb=1,
+            nk=13, constraints=[word])
 
 
 @pytest.mark.parametrize(("process", "word", "message"), [
@@ -279,15 +273,31 @@ def test_other_formulations_refuse_the_words_by_name(word):
     ("P1D", "tau:high=-2", "positive"), ("P1D", "dead_time:-1", "not negative"), ("P1D", "tau", "needs low"),
     ("P2D", "tau:3,number=4", "number=4"), ("P1D", "tau:3,number=2", "no tau2"), ("P0DI", "tau:3", "no tau")])
 def test_words_that_do_not_apply_are_refused(process, word, message):
-    with pytest.raises(StructureError, match=message):
-        fit(record(), process, constraints=[word])
+    refuses(StructureError, message, fit, record(), process, constraints=[word])
 
 
 # -- proof ---------------------------------------------------------------------------------------------------------
 
 
 def errors_of(data: optid.Data, process: str = "P1D", **options) -> ProcessErrors:
-    return process_errors(data, process, "linear", Terms(**options))
+    return process_errors(data, process, "linear", **options)
+
+
+def check_bounds(errors: ProcessErrors, boxes: np.ndarray, shares: list[np.ndarray], least: int, cone=None) -> None:
+    """Assert that the bounds of boxes (B, d, 2) say something, and lie below the values at points (B, d) within."""
+    lower, middle, _ = BranchAndBound(errors, usual_box(errors), cone).bounds(boxes)
+    assert np.sum(lower > 0.3 * middle) > least
+    for share in shares:
+        for b, numbers in enumerate(boxes[:, :, 0] + share * (boxes[:, :, 1] - boxes[:, :, 0])):
+            x = np.zeros(errors.unknowns.size)
+            x[: len(numbers)] = numbers
+            columns = errors.columns(x)
+            if cone is None:
+                value = float(np.sum((errors.y - columns @ np.linalg.lstsq(columns, errors.y)[0]) ** 2))
+            else:  # levels of any sign
+                signed = np.column_stack([columns[:, :2] @ cone, columns[:, 2:], -columns[:, 2:]])
+                value = nnls(signed, errors.y)[1] ** 2
+            assert lower[b] <= value * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -296,35 +306,28 @@ def test_bounds_of_boxes_lie_below_every_point(seed):
     u = np.repeat(rng.normal(size=8), 10)
     errors = errors_of(record(process_model("P1D", K=2.0, tau=12.0, dead_time=4.4), u, 0.3, seed), offset=seed % 2 == 0)
     low = np.column_stack([rng.uniform(0, 4, 200), rng.uniform(0, 20, 200)])
-    size = 10 ** rng.uniform(-3, 0.3, (200, 2))
-    boxes = np.column_stack([low[:, 0], low[:, 0] + size[:, 0], low[:, 1], low[:, 1] + size[:, 1]])
-    lower, middle, _ = BranchAndBound(errors, usual_box(errors)).bounds(boxes)
-    assert np.sum(lower > 0.3 * middle) > 30  # they say something
-    for (l1, l2, a, b), bound in zip(boxes, lower):
-        for share in rng.uniform(0, 1, (6, 2)):
-            x = np.zeros(errors.unknowns.size)
-            x[:2] = l1 + share[0] * (l2 - l1), a + share[1] * (b - a)
-            columns = errors.columns(x)
-            rest = errors.y - columns @ np.linalg.lstsq(columns, errors.y)[0]
-            assert bound <= rest @ rest * (1 + 1e-9)
+    boxes = np.stack([low, low + 10 ** rng.uniform(-3, 0.3, (200, 2))], axis=2)
+    check_bounds(errors, boxes, rng.uniform(0, 1, (6, 200, 2)), 30)
 
 
 def test_bounds_within_a_cone_lie_below_every_point():
     rng = np.random.default_rng(0)
-    u, cone = np.repeat(rng.integers(0, 3, 8), 10) * 1.0, np.tril(np.ones((2, 2)))
+    u = np.repeat(rng.integers(0, 3, 8), 10) * 1.0
     truth = process_model("P1D", K=2.0, tau=12.0, dead_time=4.4)
-    errors = process_errors(record(truth, np.minimum(u, 1.2), 0.3), "P1D", "triangular:2", Terms())
-    low, size = np.column_stack([rng.uniform(0, 4, 60), rng.uniform(0, 20, 60)]), 10 ** rng.uniform(-3, 0.3, (60, 2))
-    boxes = np.column_stack([low, low + size])[:, [0, 2, 1, 3]]
-    lower, middle, _ = BranchAndBound(errors, usual_box(errors), cone).bounds(boxes)
-    assert np.sum(lower > 0.3 * middle) > 10
-    for (l1, l2, a, b), bound in zip(boxes, lower):
-        for share in rng.uniform(0, 1, (6, 2)):
-            x = np.zeros(errors.unknowns.size)
-            x[:2] = l1 + share[0] * (l2 - l1), a + share[1] * (b - a)
-            columns = errors.columns(x)
-            signed = np.column_stack([columns[:, :2] @ cone, columns[:, 2:], -columns[:, 2:]])  # levels of any sign
-            assert bound <= nnls(signed, errors.y)[1] ** 2 * (1 + 1e-9)
+    errors = process_errors(record(truth, np.minimum(u, 1.2), 0.3), "P1D", "triangular:2")
+    low = np.column_stack([rng.uniform(0, 4, 60), rng.uniform(0, 20, 60)])
+    boxes = np.stack([low, low + 10 ** rng.uniform(-3, 0.3, (60, 2))], axis=2)
+    check_bounds(errors, boxes, rng.uniform(0, 1, (6, 60, 2)), 10, np.tril(np.ones((2, 2))))
+
+
+@pytest.mark.parametrize("moves", [1, 6])
+def test_bounds_for_two_poles_lie_below_every_point(moves):
+    rng = np.random.default_rng(moves)
+    u = STEP[:80] if moves == 1 else np.repeat(rng.normal(size=8), 10)
+    errors = errors_of(record(process_model("P2D", K=2.0, tau1=12.0, tau2=4.0, dead_time=4.4), u, 0.1, moves), "P2D")
+    low = np.column_stack([rng.uniform(-1, 3, (150, 2)), rng.uniform(0, 20, 150)])
+    boxes = np.stack([low, low + 10 ** rng.uniform(-3, 0.3, (150, 3)) * [1, 1, 3]], axis=2)
+    check_bounds(errors, boxes, [*rng.uniform(0, 1, (4, 150, 3)), *rng.integers(0, 2, (4, 150, 3))], 50)
 
 
 def test_a_monotone_curve_of_few_increments_is_proved():
@@ -345,25 +348,6 @@ def test_random_step_tests_are_proved(seed):
                           dead_time=rng.uniform(0, count / 4))
     found = fit(record(truth, np.where(t >= on, 1.0, 0.0), 2 * np.exp(rng.uniform(np.log(0.01), np.log(0.2))), seed))
     assert found.solution.proof and found.solution.gap < 2e-6
-
-
-@pytest.mark.parametrize("moves", [1, 6])
-def test_bounds_for_two_poles_lie_below_every_point(moves):
-    rng = np.random.default_rng(moves)
-    u = STEP[:80] if moves == 1 else np.repeat(rng.normal(size=8), 10)
-    errors = errors_of(record(process_model("P2D", K=2.0, tau1=12.0, tau2=4.0, dead_time=4.4), u, 0.1, moves), "P2D")
-    low = np.column_stack([rng.uniform(-1, 3, (150, 2)), rng.uniform(0, 20, 150)])
-    size = 10 ** rng.uniform(-3, 0.3, (150, 3)) * [1, 1, 3]
-    boxes = np.stack([low, low + size], axis=2).reshape(150, 6)
-    lower, middle, _ = BranchAndBound(errors, usual_box(errors)).bounds(boxes)
-    assert np.sum(lower > 0.3 * middle) > 50  # they say something
-    for ends, bound in zip(boxes.reshape(150, 3, 2), lower):
-        for share in (*rng.uniform(0, 1, (4, 3)), *rng.integers(0, 2, (4, 3))):
-            x = np.zeros(errors.unknowns.size)
-            x[:3] = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
-            columns = errors.columns(x)
-            rest = errors.y - columns @ np.linalg.lstsq(columns, errors.y)[0]
-            assert bound <= rest @ rest * (1 + 1e-9)
 
 
 def test_steps_of_two_poles_are_those_of_processes():
@@ -429,10 +413,8 @@ def test_types_that_the_record_does_not_tell_apart():
 
 
 def test_a_type_and_its_choice_exclude_each_other():
-    with pytest.raises(StructureError, match="give one of both"):
-        fit(record(), order="auto")
-    with pytest.raises(StructureError, match="order='bic'"):
-        optid.fit(record(), "process.exact", order="bic")
+    refuses(StructureError, "give one of both", fit, record(), order="auto")
+    refuses(StructureError, "order='bic'", fit, record(), "", order="bic")
 
 
 # -- bad input -----------------------------------------------------------------------------------------------------
@@ -441,23 +423,21 @@ def test_a_type_and_its_choice_exclude_each_other():
 def test_an_input_that_never_moves_is_refused_with_what_is_determined():
     late = FIRST.respond(STEP[:, None])[60:]  # the step lies before the record
     data = optid.Data(np.ones(140), late, dt=1.0)
-    with pytest.raises(DataError, match="'u'"):
-        fit(data)
-    with pytest.raises(DataError, match=r"'u' never moves.*before the record.*Determined is the course of 'y' alone"):
-        errors_of(data)
+    refuses(DataError, "'u'", fit, data)
+    words = r"'u' never moves.*before the record.*Determined is the course of 'y' alone"
+    refuses(DataError, words, errors_of, data)
 
 
 def test_a_dead_time_beyond_the_record_is_refused():
     quiet = 5 + 0.04 * np.random.default_rng(0).normal(size=200)
-    with pytest.raises(RankError, match=r"no response to u.*dead time may be longer.*Determined is its level alone, 5"):
-        fit(optid.Data(STEP, quiet, dt=1.0))
+    words = r"no response to u.*dead time may be longer.*Determined is its level alone, 5"
+    refuses(RankError, words, fit, optid.Data(STEP, quiet, dt=1.0))
 
 
 def test_bounds_that_leave_nothing_to_try_are_refused():
     for word in ("dead_time:low=500", "dead_time:500", "tau:high=0.001", "tau:9999"):
-        name = word.split(":")[0]
-        with pytest.raises(InfeasibleError, match=f"leave no value of {name} from .* longer or faster"):
-            fit(record(), constraints=[word])
+        said = f"leave no value of {word.split(':')[0]} from .* longer or faster"
+        refuses(InfeasibleError, said, fit, record(), constraints=[word])
 
 
 def test_a_motion_is_named_where_it_keeps_times_from_separating():
@@ -467,35 +447,18 @@ def test_a_motion_is_named_where_it_keeps_times_from_separating():
         fit(optid.Data(STEP, y + 0.04 * np.random.default_rng(0).normal(size=200), dt=1.0))
 
 
-def test_stamps_that_run_backwards_are_refused_by_sample():
-    t = T.copy()
-    t[50] = t[48]
-    with pytest.raises(DataError, match="runs backwards at sample 50"):
-        optid.Data(STEP, STEP, times=t)
-    t[50] = t[49]
-    with pytest.raises(DataError, match="stands still at sample 50"):
-        optid.Data(STEP, STEP, times=t)
-    with pytest.raises(DataError, match="one for each sample"):
-        optid.Data(STEP, STEP, times=t[:-1])
-
-
 def test_time_constant_and_dead_time_that_cannot_be_separated():
     """A response that is over between two samples shows one number of the two."""
-    u = np.where(T >= 10, 1.0, 0.0)
-    y = 5 + 2.0 * (T >= 13) - 0.6 * (T == 13)
-    with pytest.raises(RankError, match=r"tau lies below a sampling time.*dead_time. Determined is their sum"):
-        fit(optid.Data(u, y + 1e-3 * np.random.default_rng(0).normal(size=200), dt=1.0))
+    y = 5 + 2.0 * (T >= 13) - 0.6 * (T == 13) + 1e-3 * np.random.default_rng(0).normal(size=200)
+    words = "tau lies below a sampling time.*dead_time. Determined is their sum"
+    refuses(RankError, words, fit, optid.Data(STEP, y, dt=1.0))
 
 
 def test_other_impossible_requests():
-    with pytest.raises(StructureError, match="3 rows for 1 outputs"):
-        fit(record(), [["P1D"]] * 3)
-    with pytest.raises(StructureError, match="initial"):
-        fit(record(), initial="fit")
-    with pytest.raises(StructureError, match="2 entries for 1 inputs"):
-        fit(record(), ["P1D", "P1"])
-    with pytest.raises(RankError, match="output samples for"):
-        fit(optid.Data(STEP[8:12], T[8:12], dt=1.0))
+    refuses(StructureError, "3 rows for 1 outputs", fit, record(), [["P1D"]] * 3)
+    refuses(StructureError, "initial", fit, record(), initial="fit")
+    refuses(StructureError, "2 entries for 1 inputs", fit, record(), ["P1D", "P1"])
+    refuses(RankError, "output samples for", fit, optid.Data(STEP[8:12], T[8:12], dt=1.0))
 
 
 def test_missing_inputs_cut_the_record():
@@ -503,15 +466,7 @@ def test_missing_inputs_cut_the_record():
     u[100:103] = np.nan
     with pytest.warns(optid.errors.DataWarning, match="missing inputs"):
         found = fit(optid.Data(u, record().y, dt=1.0))
-    assert abs(found.params["tau"].estimate - 30) < 5 * found.params["tau"].error
-
-
-def test_the_record_is_not_modified():
-    data = record()
-    u, y = data.u.copy(), data.y.copy()
-    fit(data, "P2DZ")
-    np.testing.assert_array_equal(data.u, u)
-    np.testing.assert_array_equal(data.y, y)
+    is_near(found, {"tau": 30}, 5)
 
 
 def test_kinks_between_samples_and_changes():
@@ -528,8 +483,7 @@ def test_kinks_between_samples_and_changes():
 def test_a_search_finds_the_process_behind_a_step_test():
     found = optid.identify(record(), workers=1)
     assert found.fit.formulation == "process.exact" and found.model.orders == {"process": "P1D"}
-    for name, value in {"K": 2, "tau": 30, "dead_time": 12.4}.items():
-        assert abs(found.fit.params[name].estimate - value) < 4 * found.fit.params[name].error
+    is_near(found.fit, {"K": 2, "tau": 30, "dead_time": 12.4})
 
 
 def test_other_fits_of_a_step_test_point_to_processes():
@@ -561,10 +515,6 @@ def test_parameters_at_their_bounds_are_named():
 
 
 def test_the_command_prints_gain_time_constant_dead_time_and_proof(tmp_path):
-    from typer.testing import CliRunner
-
-    from optid.cli.app import app
-
     data = record(dt=5.0, inputs="valve", outputs="temperature", input_units="%", output_units="K",
                   start="2024-05-01T08:00")
     data.to_csv(tmp_path / "step.csv")
@@ -581,7 +531,7 @@ def test_the_command_prints_gain_time_constant_dead_time_and_proof(tmp_path):
 @pytest.mark.parametrize("process", ["P2D", "P2DZ", "P3D", "P3DU", "P3DZ"])
 def test_richer_types_fit_no_worse_and_say_what_is_not_determined(process):
     """Of a record of one pole the second one is a matter of the noise: its direction is flat, and said to be."""
-    data = record(seed=21)
+    data, again = record(seed=21), record(seed=21)
     plain = fit(data, prove=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optid.errors.DataWarning)
@@ -595,6 +545,7 @@ def test_richer_types_fit_no_worse_and_say_what_is_not_determined(process):
     worst = max(row.error / row.estimate for row in rich.params if row.name.startswith("tau"))
     said = " ".join(str(rich.figures.get(name, "")) for name in ("not determined", "bounds", "time constants"))
     assert worst < 20 or said.strip()
+    assert np.array_equal(data.u, again.u) and np.array_equal(data.y, again.y)  # the record stays as it is
 
 
 def test_a_binding_word_is_the_reason_for_failed_tests():
@@ -603,19 +554,19 @@ def test_a_binding_word_is_the_reason_for_failed_tests():
     assert any("leaving out 'tau', which binds" in one.sentence for one in found.advice)
 
 
+RAMP = record(process_model("P1DI", K=0.05, tau=9.0, dead_time=12.4, level=5.0), ((T >= 10) & (T < 60)) * 1.0, 0.01)
+
+
 @pytest.mark.parametrize("word", ["gain:low=1", "through:0,5", "range:low=0,high=9", "slope:low=0"])
 def test_words_about_rest_point_integrators_to_their_slope(word):
-    truth = process_model("P1DI", K=0.05, tau=9.0, dead_time=12.4, level=5.0)
-    with pytest.raises(StructureError, match="integrator has no static characteristic from u.*The word K"):
-        fit(record(truth, ((T >= 10) & (T < 60)) * 1.0, 0.01), "P1DI", constraints=[word])
+    refuses(StructureError, "integrator has no static characteristic from u.*The word K", fit, RAMP, "P1DI",
+            constraints=[word])
 
 
 def test_a_bound_on_the_slope_of_an_integrator_may_push_the_dead_time_to_zero():
-    truth = process_model("P1DI", K=0.05, tau=9.0, dead_time=12.4, level=5.0)
-    data = record(truth, ((T >= 10) & (T < 60)) * 1.0, 0.01)
-    held = fit(data, "P1DI", constraints=["K:low=0.06"])
+    held = fit(RAMP, "P1DI", constraints=["K:low=0.06"])
     assert held.solution.status is Status.LOCAL and estimates(held)["dead_time"] == pytest.approx(0, abs=1e-6)
-    at_zero = fit(data, "P1DI", constraints=["K:0.06", "dead_time:0"])
+    at_zero = fit(RAMP, "P1DI", constraints=["K:0.06", "dead_time:0"])
     assert held.solution.objective == pytest.approx(at_zero.solution.objective, rel=1e-6)
 
 

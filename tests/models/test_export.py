@@ -11,12 +11,14 @@ import pytest
 from refusals import refuses
 from sample_fits import feedback_fit
 from scipy import signal, special
+from state_systems import linear
 from systems import BASES, inputs, mimo, nonlinearity, siso
 from test_physical import CUBIC, bent, quiet
 
-from optid.bases import UserFunctions
+from optid.bases import Linear, UserFunctions
 from optid.errors import OptidError, StructureError
 from optid.models import Nonlinearity
+from optid.models.export import state_space
 
 
 @pytest.mark.parametrize("model", [siso(), siso(nk=3, c=[-0.6, 0.25], d=[-0.5, 0.1, 0.3]), siso(a=[]), mimo()])
@@ -35,25 +37,24 @@ def test_dlti_channels():
     assert isinstance(siso().to_dlti(), signal.dlti)
 
 
-@pytest.mark.parametrize("model", [siso(nk=2), mimo()])
-def test_control_has_the_frequency_response(model):
+@pytest.mark.parametrize("make", [lambda: siso(nk=2), mimo, linear, lambda: quiet(bent(), CUBIC).model])
+def test_control_has_the_frequency_response_and_the_names(make):
     pytest.importorskip("control")
-    system = model.to_control()
-    assert system.dt == model.dt
-    w = np.array([0.01, 0.7, 3.0])
-    response = model.frequency_response(w)
-    for k, frequency in enumerate(w):
+    model = make()
+    system, w = model.to_control(), np.array([0.01, 0.7, 3.0])
+    assert system.dt == model.dt and system.output_labels == list(model.outputs)
+    functions = model.nonlinearities or [Nonlinearity(Linear(), [1.0])] * model.m  # of a physical model
+    assert system.input_labels == [name if f.is_linear else f"f({name})" for name, f in zip(model.inputs, functions)]
+    for frequency, response in zip(w, model.frequency_response(w)):
         value = np.reshape(system(np.exp(1j * frequency * model.dt)), (model.l, model.m))
-        assert value == pytest.approx(response[k], abs=1e-10)
+        assert value == pytest.approx(response, abs=1e-10)
 
 
-def test_a_physical_model_is_exported_about_its_operating_point():
-    pytest.importorskip("control")
-    model, w = quiet(bent(), CUBIC).model, 0.7
-    system, other, expected = model.to_control(), model.to_dlti(), model.frequency_response(w).ravel()
-    assert np.ravel(system(np.exp(1j * w * model.dt))) == pytest.approx(expected, abs=1e-12)
-    assert all(np.array_equal(a, b) for a, b in zip((other.A, other.B, other.C, other.D), model.matrices))
-    assert system.input_labels == list(model.inputs)
+@pytest.mark.parametrize("make", [linear, lambda: quiet(bent(), CUBIC).model])
+def test_dlti_of_states_is_whole(make):
+    model = make()
+    system = model.to_dlti()
+    assert all(np.array_equal(a, b) for a, b in zip((system.A, system.B, system.C, system.D), state_space(model)))
 
 
 def test_control_missing_names_the_remedy(monkeypatch):
@@ -114,24 +115,11 @@ def test_user_functions_are_called_with_symbols():
     assert iterate(model.to_casadi(), u, state) == pytest.approx(model.simulate(u, x0=state), abs=1e-12)
 
 
-def test_a_user_function_that_takes_arrays_only_is_refused():
-    functions = UserFunctions((special.j1,), ("bessel",)).with_interval(-1, 1)
-    refuses(StructureError, "CasADi scalar", siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi)
-
-
-def test_a_user_function_that_means_something_else_of_symbols_is_refused():
-    functions = UserFunctions((lambda v: v * (2.0 if isinstance(v, np.ndarray) else 3.0),), ("two",)).with_interval(-1,
-                                                                                                                    1)
-    refuses(StructureError, "other values", siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi)
-
-
-def test_control_keeps_the_names_of_the_channels():
-    pytest.importorskip("control")
-    model = mimo()
-    system = model.to_control()
-    assert system.output_labels == list(model.outputs)
-    assert system.input_labels == [name if f.is_linear else f"f({name})"
-                                   for name, f in zip(model.inputs, model.nonlinearities)]
+@pytest.mark.parametrize(("function", "words"), [
+    (special.j1, "CasADi scalar"), (lambda v: v * (2.0 if isinstance(v, np.ndarray) else 3.0), "other values")])
+def test_a_user_function_that_symbols_do_not_pass_or_change_is_refused(function, words):
+    functions = UserFunctions((function,), ("own",)).with_interval(-1, 1)
+    refuses(StructureError, words, siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi)
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on PATH")

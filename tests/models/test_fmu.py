@@ -4,6 +4,7 @@ import ctypes
 import shutil
 import subprocess
 import zipfile
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -82,22 +83,19 @@ def test_an_fmu_is_valid_and_runs_as_the_simulation(name, tmp_path):
     u = np.random.default_rng(5).uniform(-1.2, 1.2, (200, model.m))
     expected = model.simulate(u)
     close = dict(abs=1e-10 * max(1.0, np.abs(expected).max()))
-    slave = Slave(path, tmp_path / "whole")
-    assert slave.run(u, model.dt) == pytest.approx(expected, **close)
-    slave.close()
-    parts = Slave(path, tmp_path / "parts", start=7.0)
-    assert parts.run(u, model.dt, step=model.dt / 4, start=7.0) == pytest.approx(expected, **close)
-    parts.close()
+    with closing(Slave(path, tmp_path / "whole")) as slave:
+        assert slave.run(u, model.dt) == pytest.approx(expected, **close)
+    with closing(Slave(path, tmp_path / "parts", start=7.0)) as parts:
+        assert parts.run(u, model.dt, step=model.dt / 4, start=7.0) == pytest.approx(expected, **close)
 
 
 @needs_gcc
 def test_long_steps_hold_the_input(tmp_path):
     model = siso(nk=1)
-    slave = Slave(model.to_fmu(tmp_path / "plant.fmu"), tmp_path / "run")
     u = np.random.default_rng(0).uniform(-0.5, 1, (30, 1))
     expected = model.simulate(np.repeat(u, 3, axis=0))[::3]
-    assert slave.run(u, 3 * model.dt) == pytest.approx(expected, abs=1e-12)
-    slave.close()
+    with closing(Slave(model.to_fmu(tmp_path / "plant.fmu"), tmp_path / "run")) as slave:
+        assert slave.run(u, 3 * model.dt) == pytest.approx(expected, abs=1e-12)
 
 
 @needs_gcc
@@ -116,9 +114,8 @@ def test_states_are_set_stored_and_restored(tmp_path):
     model = siso(nk=1)
     state, u = np.array([[0.4], [-0.3]]), inputs(model, 40)
     expected = model.simulate(u, x0=state)
-    given = Slave(model.to_fmu(tmp_path / "given.fmu", x0=state), tmp_path / "given")
-    assert given.run(u, model.dt) == pytest.approx(expected, abs=1e-12)
-    given.close()
+    with closing(Slave(model.to_fmu(tmp_path / "given.fmu", x0=state), tmp_path / "given")) as given:
+        assert given.run(u, model.dt) == pytest.approx(expected, abs=1e-12)
     slave = Slave(model.to_fmu(tmp_path / "plant.fmu"), tmp_path / "plant")
     slave.fmu.setReal(slave.x, state.ravel().tolist())
     slave.run(u[:15], model.dt)
@@ -232,9 +229,8 @@ def test_time_is_in_seconds(tmp_path):
 def test_a_physical_model_starts_from_its_start(tmp_path):
     model = quiet(bent(), CUBIC).model
     u = np.random.default_rng(0).uniform(-1, 1, (50, 1))
-    slave = Slave(model.to_fmu(tmp_path / "plant.fmu"), tmp_path / "run")
-    assert slave.run(u, model.dt) == pytest.approx(model.simulate(u), abs=1e-12)
-    slave.close()
+    with closing(Slave(model.to_fmu(tmp_path / "plant.fmu"), tmp_path / "run")) as slave:
+        assert slave.run(u, model.dt) == pytest.approx(model.simulate(u), abs=1e-12)
 
 
 @pytest.mark.parametrize("arguments, words", [

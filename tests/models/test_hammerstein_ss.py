@@ -13,7 +13,7 @@ from optid.bases import Linear, Polynomial
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
-from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
+from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity, state_simulation
 from optid.models.feedback_tables import tabulate
 from optid.models.kalman import kalman_gain
 
@@ -63,8 +63,6 @@ def test_measured_feedback_and_prediction_equal_the_equations(model, missing):
 @pytest.mark.parametrize("model", [linear(), with_feedback(), with_feedback(USER)])
 @pytest.mark.parametrize("horizon", [2, 5])
 def test_several_steps_ahead_equal_a_free_run_from_the_predicted_state(model, horizon, monkeypatch):
-    from optid.models import state_simulation
-
     monkeypatch.setattr(state_simulation, "STRETCH", 23)
     data = record(model, count=60, missing=0.1)
     found = model.predict(data, horizon=horizon, x0=state(model))
@@ -77,15 +75,14 @@ def test_several_steps_ahead_equal_a_free_run_from_the_predicted_state(model, ho
 
 
 def test_stretches_do_not_show(monkeypatch):
-    from optid.models import state_simulation
-
     model = with_feedback()
     data = record(model, missing=0.1, experiments=2)
-    whole = [model.predict(data), model.simulate_measured_feedback(data, "fit"), model.simulate(data, "fit")]
+    runs = [lambda: model.predict(data), lambda: model.simulate_measured_feedback(data, "fit"),
+            lambda: model.simulate(data, "fit")]
+    whole = [run() for run in runs]
     monkeypatch.setattr(state_simulation, "STRETCH", 13)
-    parts = [model.predict(data), model.simulate_measured_feedback(data, "fit"), model.simulate(data, "fit")]
-    for a, b in zip(whole, parts):
-        for one, other in zip(a, b):
+    for a, run in zip(whole, runs):
+        for one, other in zip(a, run()):
             assert one == pytest.approx(other, abs=1e-8)
 
 
@@ -130,8 +127,6 @@ def test_fitted_state_minimises(model, simulator):
 
 @pytest.mark.parametrize("simulator", ["predict", "measured_feedback"])
 def test_the_state_of_a_linear_model_is_the_same_without_the_kernel(simulator, monkeypatch):
-    from optid.models import state_simulation
-
     monkeypatch.setattr(state_simulation, "STRETCH", 200)  # in several parts
     for model in (linear(), linear(n=1, m=1, outputs=1)):
         data = record(model, count=150, noise=0.2)
@@ -236,9 +231,8 @@ def test_shapes_that_do_not_agree():
     refuses(StructureError, "algebraic loop", replace, with_feedback(), E=np.ones((5, 2)))
     refuses(StructureError, "output_of", replace, with_feedback(), output_of=(0, 2))
     refuses(StructureError, "input_of", replace, with_feedback(), input_of=(0, 1))
-    with pytest.raises(StructureError, match="offsets|offset_x"):
-        f = Nonlinearity(Linear(), np.ones(1), offset=1.0)
-        HammersteinSS(np.eye(1), np.eye(1), np.eye(1), nonlinearities=(f,))
+    refuses(StructureError, "offsets|offset_x", HammersteinSS, np.eye(1), np.eye(1), np.eye(1),
+            nonlinearities=(Nonlinearity(Linear(), np.ones(1), offset=1.0),))
     refuses(StructureError, "C contains a value that is not finite", replace, linear(), C=np.full((2, 3), np.nan))
     refuses(StructureError, "noise covariance S", replace, linear(n=2), noise=with_feedback().noise)
     refuses(StructureError, "gauge", replace, linear(), gauge="best")
@@ -277,18 +271,6 @@ def test_balanced_gramians(model):
     assert reach == pytest.approx(see, abs=1e-8) and reach == pytest.approx(np.diag(np.diag(reach)), abs=1e-8)
     refuses(StructureError, "unstable", linear(radius=1.1).balance)
     refuses(StructureError, "not minimal", HammersteinSS(np.diag([0.5, 0.4]), [[1.0], [0.0]], [[1.0, 1.0]]).balance)
-
-
-def test_injection_leaves_prediction_and_free_run_alone():
-    model = with_feedback()
-    data = record(model)
-    moved = model.inject_output(np.random.default_rng(0).normal(size=(3, 2)))
-    assert moved.predict(data) == pytest.approx(model.predict(data), abs=1e-9)
-    assert moved.simulate(data, x0=X0) == pytest.approx(model.simulate(data, x0=X0), abs=1e-9)
-    assert not np.allclose(moved.simulate_measured_feedback(data, x0=X0), model.simulate_measured_feedback(data, X0))
-    absorbed = model.inject_output(-model.L)
-    assert not absorbed.L.any() and absorbed.A == pytest.approx(model.A + model.L @ model.C)
-    refuses(StructureError, "gain has shape", model.inject_output, np.ones((2, 3)))
 
 
 @pytest.mark.parametrize("gauge", ["norm", "none"])
@@ -391,17 +373,6 @@ def test_without_states_it_is_a_static_map():
     data = Data(np.arange(3.0), [1.0, 3.0, 5.5])
     assert model.predict(data)[:, 0] == pytest.approx([1.0, 3.0, 5.0]) and model.is_stable
     assert model.balance() is model and HammersteinSS.from_dict(model.to_dict()).nx == 0
-
-
-# -- leaving -----------------------------------------------------------------------------------------------------------
-
-
-def test_other_tools():
-    control = pytest.importorskip("control")
-    model = linear()
-    assert control.frequency_response(model.to_control(), [0.3]).frdata[:, :, 0] == pytest.approx(
-        model.frequency_response([0.3])[0], abs=1e-10)
-    assert model.to_dlti().A == pytest.approx(model.A)
 
 
 # -- noise -------------------------------------------------------------------------------------------------------------

@@ -229,11 +229,9 @@ def test_refusals():
     refuses(StructureError, "not invertible", replace, plant, c=[1.0])
     refuses(StructureError, "not finite", replace, plant, c=[np.nan])
     refuses(StructureError, r"\(nd,\)", replace, plant, d=[[0.1]])
-    model = replace(plant, d=())
-    data, _ = noisy(model, 30)
-    refuses(StructureError, "horizon", model.predict, data, 0)
-    refuses(StructureError, "'zero', 'fit'", model.predict, data, x0="steady")
-    refuses(DataError, "sampled every", model.predict, Data(data.u, data.y, dt=7.0))
+    data, _ = noisy(MODELS["oe"], 30)
+    refuses(StructureError, "'zero', 'fit'", MODELS["oe"].predict, data, x0="steady")
+    refuses(DataError, "sampled every", MODELS["oe"].predict, Data(data.u, data.y, dt=7.0))
 
 
 def test_reflection_keeps_the_spectrum():

@@ -37,10 +37,10 @@ class ProcessPoint:
     @classmethod
     def of(cls, errors: ProcessErrors, x: Array) -> "ProcessPoint":
         """Fit the linear unknowns to the dynamics in x."""
-        columns = errors.columns(x)
-        linear = _least_squares(columns, errors.y)
-        rest = errors.y - columns @ linear
-        return cls(errors, errors.with_linear(x, linear), float(rest @ rest), columns, rest)
+        columns, x, linear = errors.columns(x), np.array(x, dtype=float), errors.unknowns.linear
+        x[linear] = _least_squares(columns, errors.y)
+        rest = errors.y - columns @ x[linear]
+        return cls(errors, x, float(rest @ rest), columns, rest)
 
     def at(self, numbers: Array) -> "ProcessPoint":
         """Return the point with other numbers (k,) of all processes."""
@@ -64,6 +64,38 @@ class ProcessPoint:
     def slopes(self, late: bool = True) -> Array:
         """Return the derivatives (rows, k) of the outputs by the numbers, everything linear fitted again."""
         return self.without_linear(self.errors.slopes(self.x, late))
+
+    def valley(self, place: int) -> Array:
+        """Return how all numbers (k,) move with the one at a place along the valley of the errors."""
+        slopes = self.slopes()
+        others = np.arange(slopes.shape[1]) != place
+        direction = np.ones(slopes.shape[1])
+        direction[others] = -np.linalg.lstsq(slopes[:, others], slopes[:, place], rcond=1e-10)[0]
+        return direction
+
+    def falls_along(self, box: "ProcessBox") -> float:
+        """Return by which share the sum of squares falls at most along the Gauss-Newton step, whole or in any part.
+
+        Where the record hardly shows a direction the step is long, and what its linear model promises does not come.
+        """
+        step = np.linalg.lstsq(self.slopes(), self.rest, rcond=1e-14)[0]
+        least = min(self.at(box.clip(self.numbers + part * step)).value for part in 0.25 ** np.arange(25))
+        return max(1 - least / max(self.value, 1e-300), 0.0)
+
+    def join_equal(self) -> "ProcessPoint":
+        """Return the point with time constants made equal that differ little, where that costs nothing.
+
+        The errors are symmetric in them: where a complex pair would fit better, the best real poles are equal.
+        """
+        x, u = self.x.copy(), self.errors.unknowns
+        for p, structure in enumerate(u.structures):
+            logs = x[u.slices[f"dynamics{p}"]][: structure.real]  # a view
+            for i in range(1, structure.real):
+                one, other = np.argsort(-logs)[i - 1 : i + 1]
+                if logs[one] - logs[other] < EQUAL:
+                    logs[[one, other]] = (logs[one] + logs[other]) / 2
+        joined = ProcessPoint.of(self.errors, x)
+        return joined if joined.value <= self.value * (1 + COSTS_NOTHING) else self
 
     @property
     def noise(self) -> float:
@@ -165,36 +197,10 @@ def sharpen(start: ProcessPoint, box: ProcessBox) -> tuple[ProcessPoint, int]:
     return min(start, end, key=lambda one: one.value), steps
 
 
-def falls_along(start: ProcessPoint, box: ProcessBox) -> float:
-    """Return by which share the sum of squares falls at most along the Gauss-Newton step, whole or in any part.
-
-    Where the record hardly shows a direction the step is long, and what its linear model promises does not come.
-    """
-    step = np.linalg.lstsq(start.slopes(), start.rest, rcond=1e-14)[0]
-    least = min(start.at(box.clip(start.numbers + part * step)).value for part in 0.25 ** np.arange(25))
-    return max(1 - least / max(start.value, 1e-300), 0.0)
-
-
-def join_equal(start: ProcessPoint) -> ProcessPoint:
-    """Return the point with time constants made equal that differ little, where that costs nothing.
-
-    The errors are symmetric in them: where a complex pair would fit better, the best real poles are equal.
-    """
-    x, u = start.x.copy(), start.errors.unknowns
-    for p, structure in enumerate(u.structures):
-        logs = x[u.slices[f"dynamics{p}"]][: structure.real]  # a view
-        for i in range(1, structure.real):
-            one, other = np.argsort(-logs)[i - 1 : i + 1]
-            if logs[one] - logs[other] < EQUAL:
-                logs[[one, other]] = (logs[one] + logs[other]) / 2
-    joined = ProcessPoint.of(start.errors, x)
-    return joined if joined.value <= start.value * (1 + COSTS_NOTHING) else start
-
-
 def _best_cell(start: ProcessPoint, box: ProcessBox, p: int, place: int) -> ProcessPoint:
     """Descend in the cell of a dead time, then in those whose middle a step along the valley finds promising."""
     errors, best, theta = start.errors, start, start.numbers[place]
-    short, valley, promising = len(errors.y) <= LONG, _valley(start, place), []
+    short, valley, promising = len(errors.y) <= LONG, start.valley(place), []
     for low, high in _cells(errors, p, theta, box.low[place], box.high[place]):
         tried = [start.at(box.clip(start.numbers + valley * (low + part * (high - low) - theta)))
                  for part in ([0.1, 0.5, 0.9] if short else [0.5])]
@@ -217,24 +223,11 @@ def _best_cell(start: ProcessPoint, box: ProcessBox, p: int, place: int) -> Proc
 def _cells(errors: ProcessErrors, p: int, theta: float, least: float, most: float) -> list[tuple[float, float]]:
     """Return the cells (low, high) of a dead time on both sides of a value."""
     low, high = errors.kinks(p, theta)
-    cells = [(low, high if high <= theta + 1e-9 else min(high, most))]
-    below, above = cells[0]
+    below, above = [low], [high]
     for _ in range(NEAR):
-        if below > least:
-            under = errors.kinks(p, below)[0]
-            cells.append((max(under, least), below))
-            below = under
-        if above < most:
-            over = errors.kinks(p, above + 1e-7)[1]
-            cells.append((above, min(over, most)))
-            above = over
-    return [(max(a, least), min(b, most)) for a, b in cells if min(b, most) > max(a, least)]
-
-
-def _valley(here: ProcessPoint, place: int) -> Array:
-    """Return how all numbers move with the dead time at a place along the valley of the errors."""
-    slopes = here.slopes()
-    others = np.arange(slopes.shape[1]) != place
-    direction = np.ones(slopes.shape[1])
-    direction[others] = -np.linalg.lstsq(slopes[:, others], slopes[:, place], rcond=1e-10)[0]
-    return direction
+        if below[-1] > least:
+            below.append(errors.kinks(p, below[-1])[0])
+        if above[-1] < most:
+            above.append(errors.kinks(p, above[-1] + 1e-7)[1])
+    edges = np.clip([*below[::-1], *above], least, most).tolist()
+    return [(a, b) for a, b in zip(edges, edges[1:]) if b > a]

@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.bases import Basis, Linear
@@ -25,7 +25,7 @@ from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.criterion import Criterion
 from optid.identify.process.unknowns import ProcessUnknowns
 from optid.models.nonlinearity import Nonlinearity
-from optid.models.process import ProcessModel
+from optid.models.process import ProcessModel, name_of_pair
 from optid.models.process_dynamics import ProcessDynamics
 from optid.models.process_kernel import thin_out
 from optid.program.compressed import Spread
@@ -94,11 +94,8 @@ class ProcessErrors(Criterion):
         return isinstance(self.bases[self.unknowns.pairs[p][1]], Linear)
 
     def key(self, name: str, number: int) -> str:
-        """Name a quantity of a pair: plain with one input, ``name[input]`` with several, ``name[output,input]``."""
-        o, c = self.unknowns.pairs[number]
-        if self.unknowns.outputs > 1:
-            return f"{name}[{self.data.outputs[o]},{self.data.inputs[c]}]"
-        return name if self.data.m == 1 else f"{name}[{self.data.inputs[c]}]"
+        """Name a quantity of a pair; see `name_of_pair`."""
+        return name_of_pair(name, self.unknowns.pairs[number], self.data)
 
     # -- outputs -----------------------------------------------------------------------------------------------------
 
@@ -244,15 +241,6 @@ class ProcessErrors(Criterion):
 
     # -- what descents and programmes need ---------------------------------------------------------------------------
 
-    def _matrix(self, x: Array) -> tuple[Array, Array]:
-        """Return the derivatives (rows, size) of the outputs in the order of x, and the errors."""
-        u, linear = self.unknowns, self.columns(x)
-        errors = linear @ x[u.linear] - self.y
-        matrix = np.zeros((len(errors), u.size))
-        matrix[:, u.linear] = linear
-        matrix[:, u.dynamic] = self._between(x, errors)
-        return matrix, errors
-
     def _between(self, x: Array, errors: Array) -> Array:
         """Return `slopes`; a dead time at a kink has a derivative between those of both sides."""
         slopes, u = self.slopes(x), self.unknowns
@@ -287,11 +275,14 @@ class ProcessErrors(Criterion):
 
         They are zero where an output is missing.
         """
-        matrix, errors = self._matrix(x)
-        shared, n = self.unknowns.shared, self.unknowns.n
+        u, matrix = self.unknowns, np.zeros((len(self.y), self.unknowns.size))
+        matrix[:, u.linear] = self.columns(x)
+        errors = matrix[:, u.linear] @ x[u.linear] - self.y
+        matrix[:, u.dynamic] = self._between(x, errors)
+        shared, n = u.shared, u.n
 
         def of(i: int) -> Iterator[tuple[Array, int]]:
-            block = np.zeros((len(self.instants[i]), self.unknowns.outputs, n + shared + 1))
+            block = np.zeros((len(self.instants[i]), u.outputs, n + shared + 1))
             here = [one for one in self.courses if one.experiment == i]
             for one in here:
                 states = slice(shared + i * n, shared + (i + 1) * n)
@@ -320,12 +311,6 @@ class ProcessErrors(Criterion):
         return bool(np.isfinite(x).all() and np.all(np.abs(numbers) <= LARGEST)
                     and np.all(np.abs(numbers[u.logarithmic]) < LARGEST_LOG)
                     and all(numbers[place] >= -AT_KINK for place in u.delays.values()))
-
-    def with_linear(self, x: Array, linear: ArrayLike) -> Array:
-        """Return the dynamics of x with other linear unknowns."""
-        found = np.array(x, dtype=float)
-        found[self.unknowns.linear] = linear
-        return found
 
     def model(self, values: Mapping[str, Array]) -> ProcessModel:
         """Return the model of named values in the units of the record."""

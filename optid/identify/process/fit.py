@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from optid.arrays import Array
@@ -15,48 +14,21 @@ from optid.identify.arguments import enough_rows
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import CONFIRMED, refine
 from optid.identify.prediction_error.tangent_problem import INSIDE, excess
-from optid.identify.process.descent import (
-    LONG,
-    ProcessBox,
-    ProcessPoint,
-    descend,
-    falls_along,
-    join_equal,
-    search_cells,
-    sharpen,
-)
+from optid.identify.process.descent import LONG, ProcessBox, ProcessPoint, descend, search_cells, sharpen
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.order import choose_types
 from optid.identify.process.pairs import for_outputs
 from optid.identify.process.profile import ProcessProfiles
 from optid.identify.process.proof import REASON, applies, better_start, certify
-from optid.identify.process.separation import (
-    describe_bounds,
-    describe_equal_ones,
-    describe_flatness,
-    refuse_inseparable,
-    refuse_silence,
-    warn_of_motion,
-)
+from optid.identify.process.separation import examine
 from optid.identify.process.starts import best_descents, usual_box
 from optid.program.solution import Bound, Status
 from optid.solving.solve import Evidence, Procedure
 
-CELL = "cell"  # of the constraint that keeps a step within the cells of the dead times
-BOUNDS = "usual bounds"  # of the constraint that keeps numbers at their usual bounds, and dead times from below zero
+BOUNDS = "usual bounds"  # of the constraint that keeps numbers within them, and dead times in their cells
 NEAR = 0.02  # of a logarithm from its bound, within which the bound is stated to solvers
 LATE = 3.0  # samples; the bound of a later dead time, zero, plays no part in the confirmation of an optimum
 ROUNDS = 3  # times that a better start is looked for over boxes
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What the search for the processes of one output ended with."""
-
-    best: ProcessPoint
-    points: Sequence[ProcessPoint]  # ends of the descents from the grid, the best first
-    figures: Mapping[str, Any]
-    steps: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +49,9 @@ class ProcessFit:
 
     def confirm(self, x: Array, figures: Mapping[str, Any], steps: int = 0, late: float = np.inf) -> Procedure:
         """Confirm a point; numbers at their usual bounds, and dead times that are not late, stay within."""
-        problem, held = self.problem(x), _at_bounds(self.errors, x, late)
-        if held:
-            problem = replace(problem, restrictions=(partial(_bounds, held),))
+        problem, near = self.problem(x), _at_bounds(self.errors, x, late)
+        if np.isfinite(near).any():
+            problem = replace(problem, restrictions=(partial(_within, self.errors, near),))
         return (yield from self.refine(problem, x, figures, steps))
 
 
@@ -104,14 +76,13 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[ProcessErrors, Array], 
         enough_rows(len(one.y), "output samples", one.unknowns.size, "poles")
     usual = [usual_box(one) for one in errors.each]
     boxes, complete, cone = read_boxes(fit.problem(errors.join(list(map(_middle, errors.each, usual)))), errors, usual)
-    found = [_searched(one, box, complete) for one, box in zip(errors.each, boxes)]
-    names = errors.data.outputs if len(found) > 1 else ("",)
+    bests, several, told, steps = zip(*map(_searched, errors.each, boxes, (complete,) * len(boxes)))
+    names = errors.data.outputs if len(bests) > 1 else ("",)
     figures = {**({"process type": said} if auto else {}), **{f"{name}{' of ' * bool(output)}{output}": word
-               for output, one in zip(names, found) for name, word in one.figures.items()}}
-    bests = [one.best for one in found]
+               for output, one in zip(names, told) for name, word in one.items()}}
     x = errors.join([best.x for best in bests])
     if complete:
-        evidence = yield from fit.confirm(x, figures, max(one.steps for one in found), LATE)
+        evidence = yield from fit.confirm(x, figures, max(steps), LATE)
         if evidence is None:
             return None
         if evidence.status is Status.INACCURATE:
@@ -121,9 +92,8 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[ProcessErrors, Array], 
         return replace(evidence, profiles=ProcessProfiles(errors, boxes, bests),
                        bound=partial(_certified, errors, boxes, bests))
     ends = []
-    for number in range(max(len(one.points) for one in found) + 1):
-        start = x if not number else errors.join(
-            [one.points[min(number, len(one.points)) - 1].x for one in found])
+    for number in range(max(map(len, several)) + 1):
+        start = x if not number else errors.join([points[min(number, len(points)) - 1].x for points in several])
         within = replace(fit.problem(start), restrictions=(partial(_cell, errors),))
         end = yield from fit.refine(within, start, dict(figures))
         if end is None:
@@ -136,23 +106,22 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[ProcessErrors, Array], 
     return replace(evidence, bound=partial(certify, errors, evidence.objective / errors.unit, boxes[0], cone))
 
 
-def _searched(errors: ProcessErrors, box: ProcessBox, complete: bool) -> Found:
-    """Search for the best optimum of one output; where the box is all there is, to the last digits."""
+def _searched(errors: ProcessErrors, box: ProcessBox, complete: bool
+              ) -> tuple[ProcessPoint, Sequence[ProcessPoint], dict[str, str], int]:
+    """Return the best optimum of one output, where the box is all there is to the last digits.
+
+    Then the ends of the descents from the grid, the best first, figures, and the steps to the last digits.
+    """
     points = best_descents(errors, box)
     several = points[: 2 if len(errors.y) <= LONG else 1]
     best, steps = min((search_cells(one, box) for one in several), key=lambda one: one.value), 0
     same = sum(one.value <= best.value * (1 + 1e-3) for one in points)
     figures = {"starts": f"{same} of {len(points)} descents from the grid end within 0.1 % of the best"}
     if complete:
-        best, steps = sharpen(join_equal(_past_the_grid(best, box)), box)
-        best = join_equal(best)
-        refuse_silence(best)
-        motion = warn_of_motion(best)  # first: it may be why times do not separate
-        refuse_inseparable(best, box)
-        told = {"start": motion, "bounds": describe_bounds(best),
-                "not determined": describe_flatness(best), "time constants": describe_equal_ones(best)}
-        figures |= {name: said for name, said in told.items() if said}
-    return Found(best, points, figures, steps)
+        best, steps = sharpen(_past_the_grid(best, box).join_equal(), box)
+        best = best.join_equal()
+        figures |= examine(best, box)
+    return best, points, figures, steps
 
 
 def _past_the_grid(best: ProcessPoint, box: ProcessBox) -> ProcessPoint:
@@ -171,7 +140,7 @@ def _past_the_grid(best: ProcessPoint, box: ProcessBox) -> ProcessPoint:
 def _judged_along(bests: Sequence[ProcessPoint], boxes: Sequence[ProcessBox], evidence: Evidence) -> Evidence:
     """Judge a point that the last programme would move far, in a direction that the record hardly shows."""
     flat = [said for name, said in evidence.figures.items() if name.startswith("not determined")]
-    if max(map(falls_along, bests, boxes)) <= CONFIRMED:
+    if max(map(ProcessPoint.falls_along, bests, boxes)) <= CONFIRMED:
         return replace(evidence, status=Status.LOCAL)
     return replace(evidence, reason=f"{evidence.reason}{'; not determined is ' * bool(flat)}{'; '.join(flat)}")
 
@@ -249,14 +218,16 @@ def _refuse_untried(errors: ProcessErrors, j: int, low: float, high: float) -> N
                           "this length and sampling time can show: relax them, or use a longer or faster record")
 
 
-def _numbers(errors: ProcessErrors, view: Any) -> cp.Expression:
-    """Return the variables of the numbers of all processes."""
-    return cp.hstack([view.inner[errors.key("dynamics", p)] for p in range(len(errors.unknowns.pairs))])
-
-
 def _ends(boxes: Sequence[ProcessBox]) -> tuple[Array, Array]:
     """Return the bounds of the numbers of all outputs one after another."""
     return np.concatenate([box.low for box in boxes]), np.concatenate([box.high for box in boxes])
+
+
+def _within(errors: ProcessErrors, ends: tuple[Array, Array], view: Any) -> dict[str, Any]:
+    """Keep the numbers of all processes between ends, where these are finite."""
+    numbers = [number for p in range(len(errors.unknowns.pairs)) for number in view.inner[errors.key("dynamics", p)]]
+    return {BOUNDS: [rule for number, low, high in zip(numbers, *ends) for rule, end in (
+        (number >= low, low), (number <= high, high)) if np.isfinite(end)]}
 
 
 def _cell(errors: ProcessErrors, view: Any) -> dict[str, Any]:
@@ -265,21 +236,12 @@ def _cell(errors: ProcessErrors, view: Any) -> dict[str, Any]:
     low, high = _ends([*map(usual_box, errors.each)])
     for p, place in errors.unknowns.delays.items():
         low[place], high[place] = errors.cell(x, p)
-    numbers = _numbers(errors, view)
-    return {CELL: [numbers >= low, numbers <= high]}
+    return _within(errors, (low, high), view)
 
 
-def _at_bounds(errors: ProcessErrors, x: Array, late: float) -> list[tuple[str, int, float, float]]:
-    """Return (variable, entry, sign, bound) of numbers at their usual bounds, and of dead times up to a late one."""
-    found, (low, high) = [], _ends([*map(usual_box, errors.each)])
-    for value, (p, name), least, most in zip(x[errors.unknowns.dynamic], errors.unknowns.numbers, low, high):
-        there = errors.key("dynamics", p), errors.unknowns.structures[p].names.index(name)
-        if value <= least + (late if name == "dead_time" else NEAR):
-            found.append((*there, 1.0, float(least)))
-        if value >= most - (1e-9 if name == "dead_time" else NEAR):
-            found.append((*there, -1.0, float(most)))
-    return found
-
-
-def _bounds(held: Sequence[tuple[str, int, float, float]], view: Any) -> dict[str, Any]:
-    return {BOUNDS: [sign * (view.inner[name][i] - bound) >= 0 for name, i, sign, bound in held]}
+def _at_bounds(errors: ProcessErrors, x: Array, late: float) -> tuple[Array, Array]:
+    """Return the usual bounds of numbers that lie there, and of dead times up to a late one; others are infinite."""
+    numbers, (low, high) = x[errors.unknowns.dynamic], _ends([*map(usual_box, errors.each)])
+    delayed = np.isin(np.arange(len(numbers)), [*errors.unknowns.delays.values()])
+    return (np.where(numbers <= low + np.where(delayed, late, NEAR), low, -np.inf),
+            np.where(numbers >= high - np.where(delayed, 1e-9, NEAR), high, np.inf))

@@ -108,7 +108,5 @@ def _end(best: ProcessPoint, box: ProcessBox, place: int, step: float, most: flo
 
 def _width(best: ProcessPoint, place: int) -> float:
     """Return the standard error of a number by the derivatives at the optimum, the first step of the search."""
-    slopes = best.slopes()
-    others = np.delete(slopes, place, axis=1)
-    own = np.linalg.norm(slopes[:, place] - others @ np.linalg.lstsq(others, slopes[:, place], rcond=1e-10)[0])
-    return max(best.noise / max(float(own), 1e-300), 1e-6) if own > 0 else 1.0
+    own = float(np.linalg.norm(best.slopes() @ best.valley(place)))
+    return max(best.noise / max(own, 1e-300), 1e-6) if own > 0 else 1.0

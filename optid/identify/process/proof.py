@@ -112,7 +112,7 @@ class Search:
     bound: float
     best: float
     point: Array  # the middle
-    left: Array  # (B, 2 d) boxes that were not discarded
+    left: Array  # (B, d, 2) boxes that were not discarded
     boxes: int
 
 
@@ -155,7 +155,7 @@ class BranchAndBound:
         for one, drive in self.errors.courses_of(0):
             values = drive.values @ coefficients
             moves = one.instants, drive.changes[1:], np.diff(values)
-            x, *rests = one_pole_courses(boxes, smooth, *moves) if boxes.shape[1] == 4 else two_pole_courses(
+            x, *rests = one_pole_courses(boxes, smooth, *moves) if boxes.shape[1] == 2 else two_pole_courses(
                 boxes, *moves)
             x[:, 0] += values[0]
             parts.append((x, *rests))
@@ -165,8 +165,8 @@ class BranchAndBound:
         return x, np.linalg.norm(rough, axis=1), np.linalg.norm(fine, axis=1)
 
     def bounds(self, boxes: Array) -> tuple[Array, Array, Array]:
-        """Return lower bounds (B,) on V over boxes (B, 2 d), V at their middles, and the effects (B, d) of halves."""
-        h, slowest = np.diff(_ends(boxes))[:, :, 0] / 2, np.exp(_ends(boxes)[:, :-1].mean(axis=2).max(axis=1))
+        """Return lower bounds (B,) on V over boxes (B, d, 2), V at their middles, and the effects (B, d) of halves."""
+        h, slowest = np.diff(boxes)[:, :, 0] / 2, np.exp(boxes[:, :-1].mean(axis=2).max(axis=1))
         plain = np.column_stack([h[:, :-1], h[:, -1] / np.clip(slowest, 1.0, max(self.errors.length / RAMP, 1.0))])
         if self.cone is not None:
             return self._cone_bounds(self.cone, boxes, h, plain)
@@ -213,7 +213,7 @@ class BranchAndBound:
         """
         ends = [np.linspace(low, high, PIECES + 1) for low, high in zip(self.box.low, self.box.high)]
         lows, highs = (np.meshgrid(*(end[part] for end in ends)) for part in (slice(None, -1), slice(1, None)))
-        boxes = np.column_stack([side.ravel() for pair in zip(lows, highs) for side in pair])
+        boxes = np.ascontiguousarray(np.array([lows, highs]).reshape(2, len(ends), -1).T)
         count, bound, begun, best, point = 0, np.inf, time.thread_time(), np.inf, self.box.low
         size = int(np.clip(ENTRIES // len(self.errors.y), 10, BATCH))
         while len(boxes := self._different(boxes)):
@@ -224,10 +224,10 @@ class BranchAndBound:
             count += len(part)
             k = int(np.argmin(middle))
             if middle[k] < best:
-                best, point = float(middle[k]), part[k].reshape(-1, 2).mean(axis=1)
+                best, point = float(middle[k]), part[k].mean(axis=1)
             out = lower >= min(value, best) * (1 - gap)
             bound = min(bound, float(np.min(lower[out], initial=np.inf)))
-            boxes = np.vstack([boxes, self._halves(part[~out], np.argmax(effects[~out], axis=1))])
+            boxes = np.concatenate([boxes, self._halves(part[~out], np.argmax(effects[~out], axis=1))])
         return Search(min(bound, value), best, point, boxes, count)
 
     def _different(self, boxes: Array) -> Array:
@@ -235,28 +235,27 @@ class BranchAndBound:
         low, high = self.box.low, self.box.high
         if len(low) == 2 or low[0] != low[1] or high[0] != high[1]:
             return boxes
-        return boxes[boxes[:, 1] > boxes[:, 2]]
+        return boxes[boxes[:, 0, 1] > boxes[:, 1, 0]]
 
     def _inside(self, boxes: Array) -> NDArray[np.intp]:
         """Return how many kinks lie inside of boxes; two poles have none."""
-        if boxes.shape[1] > 4:
+        if boxes.shape[1] > 2:
             return np.zeros(len(boxes), dtype=np.intp)
-        return np.searchsorted(self.kinks, boxes[:, 3] - 1e-10) - np.searchsorted(self.kinks, boxes[:, 2] + 1e-10)
+        low, high = boxes[:, 1].T
+        return np.searchsorted(self.kinks, high - 1e-10) - np.searchsorted(self.kinks, low + 1e-10)
 
     def _halves(self, boxes: Array, wide: NDArray[np.intp]) -> Array:
-        """Return both halves of boxes (B, 2 d), of the unknown (B,) that changes more; theta at a kink near there."""
-        ends = _ends(boxes)
-        middles, kinked = ends.mean(axis=2), self._inside(boxes) > 0
+        """Return both halves of boxes (B, d, 2), of the unknown (B,) that changes more; theta at a kink near there."""
+        middles, kinked = boxes.mean(axis=2), self._inside(boxes) > 0
         if kinked.any():
             at = np.searchsorted(self.kinks, middles[:, 1])
             before, after = self.kinks[np.maximum(at - 1, 0)], self.kinks[np.minimum(at, len(self.kinks) - 1)]
             near = np.where(np.abs(before - middles[:, 1]) < np.abs(after - middles[:, 1]), before, after)
-            kinked &= (near > boxes[:, 2] + 1e-10) & (near < boxes[:, 3] - 1e-10)
+            kinked &= (near > boxes[:, 1, 0] + 1e-10) & (near < boxes[:, 1, 1] - 1e-10)
             middles[:, 1] = np.where(kinked, near, middles[:, 1])
-        split = np.equal.outer(wide, np.arange(ends.shape[1]))
-        first = np.stack([ends[:, :, 0], np.where(split, middles, ends[:, :, 1])], axis=2)
-        second = np.stack([np.where(split, middles, ends[:, :, 0]), ends[:, :, 1]], axis=2)
-        return np.vstack([first.reshape(boxes.shape), second.reshape(boxes.shape)])
+        first, second, every = boxes.copy(), boxes.copy(), np.arange(len(boxes))
+        first[every, wide, 1] = second[every, wide, 0] = middles[every, wide]
+        return np.concatenate([first, second])
 
     def certify(self, value: float) -> Bound:
         """Return the lower bound on V within the box for a point with this value."""
@@ -271,7 +270,7 @@ class BranchAndBound:
         words = f"{found.boxes} boxes in {time.thread_time() - begun:.2g} s"
         if len(found.left):
             return Bound(0.0, False, METHOD, f"given up after {words}: {len(found.left)} boxes are left, down to a "
-                         f"dead time of {self._time(found.left[:, -2].min())}")
+                         f"dead time of {self._time(found.left[:, -1, 0].min())}")
         gap = max(0.0, 1 - found.bound / value) if value > 0 else 0.0
         if found.best < value * (1 - GAP):
             return Bound(found.bound, False, METHOD, f"a better point was found by the proof ({words}): time constant "
@@ -284,11 +283,6 @@ class BranchAndBound:
 
     def _time(self, samples: float) -> str:
         return f"{samples * self.errors.data.dt:.4g} {self.errors.data.time_unit}".rstrip()
-
-
-def _ends(boxes: Array) -> Array:
-    """Return the ends (B, d, 2) of boxes (B, 2 d)."""
-    return boxes.reshape(len(boxes), boxes.shape[1] // 2, 2)
 
 
 def applies(errors: ProcessErrors) -> bool:

@@ -1,6 +1,5 @@
 """A record as the errors of processes need it: its instants, its units, and what it cannot tell refused by name."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from optid.errors import DataError, StructureError
 from optid.identify.arguments import check_offset, outputs_in_memory
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.unknowns import ProcessUnknowns
-from optid.models.process import HOLDS
+from optid.models.equations import HOLDS
 from optid.models.process_dynamics import read_structures
 from optid.program.units import in_units, inner_bases, own_units
 
@@ -22,38 +21,27 @@ INITIAL = ("rest", "free")
 SHORTEST = 8  # samples of a stretch between missing inputs that is used
 
 
-@dataclass(frozen=True)
-class Terms:
-    """What there is beside the processes; see `formulations.process.process`."""
-
-    hold: str = "zero"
-    offset: Any = True
-    drift: Any = False
-    initial: str = "rest"
-
-    def __post_init__(self) -> None:
-        one_of("hold", self.hold, HOLDS)
-        one_of("initial", self.initial, INITIAL)
-        if not isinstance(self.drift, bool | np.bool_):
-            raise StructureError(f"drift must be True or False; got {self.drift!r}")
-
-
-def process_errors(data: Data, process: Any, basis: Any, terms: Terms) -> ProcessErrors:
+def process_errors(data: Data, process: Any, basis: Any, hold: str = "zero", offset: Any = True, drift: Any = False,
+                   initial: str = "rest") -> ProcessErrors:
     """Check the arguments of a fit, and return its errors on the record in units of their own.
 
     Arguments and errors as of `formulations.process.process`.
     """
+    one_of("hold", hold, HOLDS)
+    one_of("initial", initial, INITIAL)
+    if not isinstance(drift, bool | np.bool_):
+        raise StructureError(f"drift must be True or False; got {drift!r}")
     data = outputs_in_memory(data, "simulation errors")
     rows = read_structures(process, data.inputs, data.outputs)
-    free = terms.initial == "free"
+    free = initial == "free"
     if any(np.isnan(e.u).any() for e in data.experiments):
         data, free = with_whole_inputs(data, SHORTEST), True  # no stretch but the first may begin at rest
     instants = tuple(np.arange(float(e.n_samples)) if e.stamps is None else e.stamps / data.dt
                      for e in data.experiments)
     refuse_still_inputs(data)
-    bases, constants = fitted_bases(data, basis), check_offset(terms.offset, data)
+    bases, constants = fitted_bases(data, basis), check_offset(offset, data)
     lines = [isinstance(one, Linear) for one in bases]
-    if terms.hold == "first" and not all(lines):
+    if hold == "first" and not all(lines):
         raise StructureError("hold='first' is exact for straight static curves only: use hold='zero' with a basis")
     own = [own_units(data.select(outputs=name), lines, bool(constants)) for name in data.outputs]
     units = Transform(own[0].u_scale, (0.0,) * data.m, tuple(one.y_scale[0] for one in own),
@@ -62,8 +50,8 @@ def process_errors(data: Data, process: Any, basis: Any, terms: Terms) -> Proces
     there = [(o, c, one) for o, row in enumerate(rows) for c, one in enumerate(row) if one is not None]
     unknowns = ProcessUnknowns(
         tuple((o, c) for o, c, _ in there), tuple(one for *_, one in there), tuple(inner[c].size for _, c, _ in there),
-        data.n_experiments, constants is True, bool(terms.drift), free, constants == "each")
-    return ProcessErrors(in_units(data, units), unknowns, inner, units, instants, terms.hold == "first")
+        data.n_experiments, constants is True, bool(drift), free, constants == "each")
+    return ProcessErrors(in_units(data, units), unknowns, inner, units, instants, hold == "first")
 
 
 def refuse_still_inputs(data: Data) -> None:

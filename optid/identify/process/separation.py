@@ -21,7 +21,17 @@ TAUS = ("tau1", "tau2", "tau3")  # of which several may be equal
 ALIKE = 1e-7  # singular value of the scaled derivatives, relative to the largest, at which parameters are not separable
 
 
-def refuse_silence(best: ProcessPoint) -> None:
+def examine(best: ProcessPoint, box: ProcessBox) -> dict[str, str]:
+    """Refuse a point whose numbers the record does not determine (`RankError`), warn, and say what is doubtful."""
+    _refuse_silence(best)
+    motion = _warn_of_motion(best)  # first: it may be why times do not separate
+    _refuse_inseparable(best, box)
+    told = {"start": motion, "bounds": _describe_bounds(best), "not determined": _describe_flatness(best),
+            "time constants": _describe_equal_ones(best)}
+    return {name: said for name, said in told.items() if said}
+
+
+def _refuse_silence(best: ProcessPoint) -> None:
     """Refuse a record in which the output shows no response to any input (`RankError`)."""
     errors, u = best.errors, best.errors.unknowns
     still, used = best.columns[:, sum(u.sizes) :], len(u.dynamic) + sum(u.sizes)
@@ -49,7 +59,7 @@ def _inputs(best: ProcessPoint) -> list[str]:
     return [best.errors.data.inputs[c] for _, c in best.errors.unknowns.pairs]
 
 
-def refuse_inseparable(best: ProcessPoint, box: ProcessBox) -> None:
+def _refuse_inseparable(best: ProcessPoint, box: ProcessBox) -> None:
     """Refuse time constants and dead times that the record shows only together (`RankError`)."""
     _refuse_instant(best, box)
     slopes, names = _with_equal_ones_together(best), np.array(_names(best))
@@ -70,7 +80,7 @@ def refuse_inseparable(best: ProcessPoint, box: ProcessBox) -> None:
                         f"separate them. {_determined(best)}")
 
 
-def warn_of_motion(best: ProcessPoint) -> str:
+def _warn_of_motion(best: ProcessPoint) -> str:
     """Warn where experiments do not begin at rest: a score test of motions of their own; return its finding or ""."""
     errors, u = best.errors, best.errors.unknowns
     if u.free:
@@ -94,11 +104,11 @@ def warn_of_motion(best: ProcessPoint) -> str:
         return ""
     warnings.warn(f"output {errors.data.outputs[0]!r} does not begin at rest under its first inputs "
                   f"({p_equals(p, 1)}): initial='free' estimates a motion of its own for every experiment; gain and "
-                  "time constants are biased without it", DataWarning, stacklevel=2)
+                  "time constants are biased without it", DataWarning, stacklevel=3)
     return f"not at rest ({p_equals(p, 1)})"
 
 
-def describe_bounds(best: ProcessPoint) -> str:
+def _describe_bounds(best: ProcessPoint) -> str:
     """Return which parameters lie at the smallest or largest value that is tried, and what that means; "" for none."""
     box, data, found = usual_box(best.errors), best.errors.data, []
     values = np.concatenate([one.in_unit(1 / data.dt).p for one in best.errors.processes(best.x)])
@@ -112,10 +122,10 @@ def describe_bounds(best: ProcessPoint) -> str:
     return "; ".join(found)
 
 
-def describe_flatness(best: ProcessPoint) -> str:
+def _describe_flatness(best: ProcessPoint) -> str:
     """Return which parameters may change manyfold, together, without an effect beyond the noise; "" for none.
 
-    Those at a bound are not among them: see `describe_bounds`.
+    Those at a bound are not among them: see `_describe_bounds`.
     """
     box, logs = usual_box(best.errors), best.errors.unknowns.logarithmic
     slopes = best.without_linear(_with_equal_ones_together(best))
@@ -149,7 +159,7 @@ def _with_equal_ones_together(best: ProcessPoint) -> Array:
     return slopes
 
 
-def describe_equal_ones(best: ProcessPoint) -> str:
+def _describe_equal_ones(best: ProcessPoint) -> str:
     """Return which time constants coincide, and what that means; "" for none."""
     found, u = [], best.errors.unknowns
     for p, (one, name) in enumerate(zip(u.structures, _inputs(best))):

@@ -33,7 +33,7 @@ def one_pole_courses(boxes, smooth, t, s, w):
     """Return the responses of one pole at the middles of boxes, and how far they are from there, and from tangents.
 
     Args:
-        boxes: (B, 4) log tau from, to; theta from, to.
+        boxes: (B, 2, 2) log tau from, to; theta from, to.
         smooth: (B,) whether no kink lies inside.
         t: (N,) instants.
         s: (J,) times of the moves of the input.
@@ -46,7 +46,7 @@ def one_pole_courses(boxes, smooth, t, s, w):
     count, n = len(boxes), len(t)
     x, rough, fine = np.zeros((count, 3, n)), np.zeros((count, n)), np.zeros((count, n))
     for i in range(count):
-        l1, l2, a, b = boxes[i]
+        (l1, l2), (a, b) = boxes[i]
         low_tau, high_tau, tau = np.exp(l1), np.exp(l2), np.exp((l1 + l2) / 2)
         h1, h2, theta = (l2 - l1) / 2, (b - a) / 2, (a + b) / 2
         for k in range(n):
@@ -108,16 +108,9 @@ def _average(mean, value, kept):
 
 @cached_njit
 def _add_course(found, rough, t, move, middle, slow, fast):
-    """Add the response to one move of the input, and how far it is from those of the corners of a box.
+    """Add the response to one move (time, size) and its derivatives (4, N), and how far (N,) it is from the corners'.
 
-    Args:
-        found: (4, N) response and derivatives, added to.
-        rough: (N,) distances, added to.
-        t: (N,) instants.
-        move: its time and size.
-        middle: time constants and dead time in the middle of the box.
-        slow: the largest of the box.
-        fast: the smallest.
+    Time constants and dead time are those in the middle of the box, its largest (slow) and its smallest ones (fast).
     """
     for k in range(len(t)):
         since = t[k] - move[0]
@@ -132,18 +125,10 @@ def _add_course(found, rough, t, move, middle, slow, fast):
 
 @cached_njit
 def _add_rest(rest, t, move, slow, fast, half):
-    """Add how far the response to one move can be off its tangent: second derivatives times halves of a box.
+    """Add how far (N,) the response to one move can be off its tangent: second derivatives times halves of a box.
 
     Functions and averages are those of the docstring of the module in units of 1 / tau: ``q1_k2`` is q1 * k2. From one
-    sample to the next no function exceeds its bound at the first.
-
-    Args:
-        rest: (N,) distances, added to.
-        t: (N,) instants.
-        move: its time and size.
-        slow: the largest time constants and dead time of the box.
-        fast: the smallest.
-        half: half the edges of the box.
+    sample to the next no function exceeds its bound at the first. Arguments as of `_add_course`; half the box's edges.
     """
     tau1, tau2, early = fast
     h1, h2, h3 = half
@@ -170,11 +155,11 @@ def _add_rest(rest, t, move, slow, fast, half):
 
 @cached_njit
 def two_pole_courses(boxes, t, s, w):
-    """Return the same as `one_pole_courses` for two poles and boxes (B, 6) of log tau1, log tau2 and theta."""
+    """Return the same as `one_pole_courses` for two poles and boxes (B, 3, 2) of log tau1, log tau2 and theta."""
     count, n = len(boxes), len(t)
     x, rough, fine = np.zeros((count, 4, n)), np.zeros((count, n)), np.zeros((count, n))
     for i in range(count):
-        a1, b1, a2, b2, early, late = boxes[i]
+        (a1, b1), (a2, b2), (early, late) = boxes[i]
         fast, slow = (np.exp(a1), np.exp(a2), early), (np.exp(b1), np.exp(b2), late)
         middle = np.exp((a1 + b1) / 2), np.exp((a2 + b2) / 2), (early + late) / 2
         half = (b1 - a1) / 2, (b2 - a2) / 2, (late - early) / 2

@@ -20,7 +20,7 @@ from optid.identify.informativity import Informativity, Process, informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.levels import LevelEvidence, level_evidence
 from optid.identify.process.order import best_basis, choose_types
-from optid.identify.process.record import Terms, process_errors
+from optid.identify.process.record import process_errors
 from optid.identify.search.determined import determined_bases
 from optid.identify.search.trial import CLEAR, FEEDBACK, INPUTS, KINDS, LATENT, LINEAR, StructureCandidate, Trial, near
 
@@ -215,7 +215,7 @@ def processes_by_criterion(ladder: Ladder, kind: str, bases: Sequence[Any] = ("l
 
     The errors raised are those of `choose_types`.
     """
-    errors = [process_errors(ladder.data, "P1D", basis, Terms(initial="free")) for basis in bases]
+    errors = [process_errors(ladder.data, "P1D", basis, initial="free") for basis in bases]
     place = best_basis(errors)
     words = [one.word for one in choose_types(errors[place])[0].unknowns.structures]
     curve = {} if bases[place] == "linear" else {"basis": bases[place]}
