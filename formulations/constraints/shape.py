@@ -292,10 +292,6 @@ def _smooth(basis: Any, word: str) -> Any:
     return basis
 
 
-def _inputs(view: View, channel: str | None) -> Sequence[str]:
-    return view.channels if channel is None else [channel]
-
-
 def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray], heights: bool = True
           ) -> Rule:
     """Rows on f that are not negative; ``heights`` marks differences of its values."""
@@ -304,24 +300,26 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
         if direction == "decreasing" and channel in view.spans:
             raise StructureError(f"the sign of {channel} is arbitrary, so that 'decreasing' and 'increasing' are "
                                  "equivalent: use 'increasing'")
+        inputs = view.channels if channel is None else [channel]
         found = [Limit(_rows(view, one, rows) @ curve >= 0, bound=one,
                        step=_range_of(view.basis(one), curve) if heights else None, words=RANGE if heights else "")
-                 for one in _inputs(view, channel) for curve in view.curves(one)]
-        ways: dict[str, Any] = {one: view.direction(one) for one in _inputs(view, channel)}
-        return found + [Limit(b >= 0, bound=f"direction of {one}") for one, b in ways.items()
-                        if b is not None]
+                 for one in inputs for curve in view.curves(one)]
+        ways: Any = [(one, view.direction(one)) for one in inputs]
+        return found + [Limit(b >= 0, bound=f"direction of {one}") for one, b in ways if b is not None]
 
     return Rule(label(f"{word}:{direction}" if direction else word, channel), build)
 
 
 def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
-    def limit(view: View, one: str) -> Limit:
-        whole, coefficients = _rows(view, one, rows), view.function(one)
-        matrix = _independent(whole)
-        return Limit(matrix @ coefficients == 0, band=whole, span=matrix, step=_range_of(view.basis(one), coefficients),
-                     words=RANGE)
+    def build(view: View) -> list[Limit]:
+        found = []
+        for one in view.channels if channel is None else [channel]:
+            whole, coefficients = _rows(view, one, rows), view.function(one)
+            matrix, step = _independent(whole), _range_of(view.basis(one), coefficients)
+            found.append(Limit(matrix @ coefficients == 0, band=whole, span=matrix, step=step, words=RANGE))
+        return found
 
-    return Rule(label(word, channel), lambda view: [limit(view, one) for one in _inputs(view, channel)])
+    return Rule(label(word, channel), build)
 
 
 def _rows(view: View, channel: str, rows: Callable[[Any], np.ndarray]) -> np.ndarray:
