@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from problems import BASIS, plant, record
+from refusals import refuses
 from systems import nonlinearity
 
 import optid
@@ -154,12 +155,6 @@ def test_real_poles_of_a_fit():
     assert poles[0] <= 0.55 + 1e-6 and poles[1] >= 0.55 - 1e-6
 
 
-def test_a_slack_radius_changes_nothing():
-    free = optid.fit(record(), na=2, nb=2, basis=BASIS)
-    fit = optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=["stable:0.99"])
-    assert fit.solution.objective == pytest.approx(free.solution.objective, rel=1e-9)
-
-
 @pytest.mark.parametrize("call, words", [
     (lambda: stable(0.0), r"\(0, 1\]"),
     (lambda: stable(1.5), r"\(0, 1\]"),
@@ -169,5 +164,4 @@ def test_a_slack_radius_changes_nothing():
     (lambda: optid.fit(record(), na=0, nb=2, basis=BASIS, constraints=["stable"]), "na is 0"),
 ])
 def test_bad_arguments(call, words):
-    with pytest.raises(StructureError, match=words):
-        call()
+    refuses(StructureError, words, call)
