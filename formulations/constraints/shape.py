@@ -69,10 +69,7 @@ def convex(channel: str | None = None) -> Rule:
 
 @record_arguments
 def concave(channel: str | None = None) -> Rule:
-    """The nonlinearity, and the static characteristic with it, is concave over the interval of its basis.
-
-    As `convex`.
-    """
+    """The nonlinearity, and the static characteristic with it, is concave over its interval; otherwise as `convex`."""
     return _cone("concave", "", channel, lambda basis: -_smooth(basis, "concave").curvature(), heights=False)
 
 
@@ -109,10 +106,9 @@ def saturation(low: float | None = None, high: float | None = None, channel: str
     """The nonlinearity is constant below ``low`` and above ``high``.
 
     Raises:
-        StructureError: neither level given.
+        StructureError: neither level given, or levels that cross.
     """
-    if low is None and high is None:
-        raise StructureError("saturation needs a level: low=, high= or both")
+    check_bounds("saturation", low, high)
 
     def rows(basis: Any) -> np.ndarray:
         lo, hi = basis.interval
@@ -285,7 +281,6 @@ def slopes_at(basis: Any, at: float | None) -> np.ndarray:
 
 
 def _smooth(basis: Any, word: str) -> Any:
-    """Refuse a basis of steps for a rule about slopes."""
     if isinstance(basis, PiecewiseConstant):
         raise StructureError(f"{word!r} is about slopes, and a piecewise constant function has none: choose "
                              f"'triangular:{basis.p}', or bound its steps by monotone or range")
