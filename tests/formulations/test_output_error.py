@@ -57,20 +57,18 @@ def test_noise_free_systems_are_recovered(basis, a, b, nk):
     assert fit.solution.objective < 1e-14 * fit.solution.scale
 
 
-def test_linear_model_of_several_inputs_is_recovered():
-    linear = Nonlinearity(Linear().with_interval(-0.7, 1.3), np.ones(1))
-    true = HammersteinTF([-1.1, 0.4], ([1.0, 0.5], [0.3, -0.2, 0.4]), (linear, linear), (0, 2), 0.2)
-    fit = optid.fit(record(true, noise=0.0), "oe.exact", na=2, nb=[2, 3], nk=[0, 2])
-    assert distance(fit.model, true) < 1e-8
-    assert fit.model.title == "Linear output-error model"
+LINE = Nonlinearity(Linear().with_interval(-0.7, 1.3), np.ones(1))
 
 
-def test_hammerstein_model_of_several_inputs_is_recovered():
-    functions = (nonlinearity(BASIS, 1), nonlinearity(Polynomial(3), 2))
-    true = HammersteinTF([-1.1, 0.4], ([1.0, 0.5], [0.3, -0.2, 0.4]), functions, (0, 1), 0.2)
-    fit = optid.fit(record(true, noise=0.0), "hammerstein_oe.exact", na=2, nb=[2, 3], nk=[0, 1],
-                    basis=[f.basis for f in functions])
-    assert distance(fit.model, true) < 1e-7
+@pytest.mark.parametrize("name, functions, nk, near", [
+    ("oe.exact", (LINE, LINE), (0, 2), 1e-8),
+    ("hammerstein_oe.exact", (nonlinearity(BASIS, 1), nonlinearity(Polynomial(3), 2)), (0, 1), 1e-7)])
+def test_models_of_several_inputs_are_recovered(name, functions, nk, near):
+    true = HammersteinTF([-1.1, 0.4], ([1.0, 0.5], [0.3, -0.2, 0.4]), functions, nk, 0.2)
+    bases = {} if name == "oe.exact" else {"basis": [f.basis for f in functions]}
+    fit = optid.fit(record(true, noise=0.0), name, na=2, nb=[2, 3], nk=nk, **bases)
+    assert distance(fit.model, true) < near
+    assert ("Linear output-error model" == fit.model.title) == (name == "oe.exact")
 
 
 def test_experiments_of_unequal_length_with_states_of_their_own_and_missing_outputs():
