@@ -41,8 +41,8 @@ def certify_groups(problem: Problem, form: GroupSparseForm, values: Values, dual
     candidates: list[Array] = [numbers.target - numbers.design @ a]
     if (given := form.dual_point(duals)) is not None:
         candidates.append(given)
-    lagrangian = _lagrangian(problem, form, duals)
-    bounds = [numbers.dual(v, form.penalty, *parts) for parts in (lagrangian, ()) for v in candidates]
+    bounds = [numbers.dual(v, form.penalty, slope, constant) for slope, constant in (
+        _lagrangian(problem, form, duals), (0.0, 0.0)) for v in candidates]
     return _best(bounds, numbers.value(a, form.penalty), problem, "group-sparse dual")
 
 

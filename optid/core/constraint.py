@@ -112,14 +112,15 @@ class Constraint:
         return space.rows({names[one.id]: sp.diags_array(1 / self.sizes) @ part for one, part in parts.items()
                            if one.id in names}, len(self))
 
-    def violation(self, space: LeafSpace, y: Values) -> float:
-        """Return the sum of the violations of its rows, or the largest one of a matrix."""
-        g = self.residual(space, y)
-        if self.is_equality:
-            return float(np.sum(np.abs(g)))
+    def violations(self, g: Array) -> Array:
+        """Return by how much every row is violated where it has the value g (m,); of a matrix one number."""
         if self.cone == "psd":
-            return largest_eigenvalue(g)
-        return float(np.sum(np.maximum(g, 0.0)))
+            return np.array([largest_eigenvalue(g)])
+        return np.abs(g) if self.is_equality else np.maximum(g, 0.0)
+
+    def violation(self, space: LeafSpace, y: Values) -> float:
+        """Return the sum of the violations at values of the leaves."""
+        return float(np.sum(self.violations(self.residual(space, y))))
 
 
 def join_by_name(constraints: Sequence[Constraint], parts: Sequence[Array]) -> dict[str, Array]:

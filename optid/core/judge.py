@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.arrays import Array, largest
-from optid.core.constraint import Constraint, join_by_name, largest_eigenvalue, symmetric_part
+from optid.core.constraint import Constraint, join_by_name, symmetric_part
 from optid.core.leaves import LeafSpace, positions, variable_size
 from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, Length, NuclearNorms, Values, flat
@@ -162,11 +162,7 @@ def largest_excess(problem: Problem, x: Values, unknowns: frozenset[str] = froze
 
 def _excess(one: Constraint, g: Array) -> float:
     """Return the largest violation of a row, in its own units, or of a matrix; infinite where it is not finite."""
-    if not np.all(np.isfinite(g)):
-        return float("inf")
-    if one.cone == "psd":
-        return largest_eigenvalue(g)
-    return float(np.max(np.abs(g) if one.is_equality else np.maximum(g, 0.0), initial=0.0))
+    return float(np.max(one.violations(g), initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
 
 
 def sizes_of_terms(one: Constraint, rows: Any, g: Array, space: LeafSpace, y: Values) -> tuple[float, float]:

@@ -359,14 +359,9 @@ class Problem:
 
     def _violations(self, x: Values) -> Array:
         """Return the violation of every row (of a matrix: the largest) of the user's constraints at a point."""
-        y, found = self.leaf_values(x), []
-        for one in self.constraints():
-            if self._is_own(one):
-                continue
-            g = one.residual(self.space, y)
-            found.append(np.array([one.violation(self.space, y)]) if one.cone in ("psd", "other") else
-                         np.abs(g) if one.is_equality else np.maximum(g, 0.0))
-        return np.concatenate(found)
+        y = self.leaf_values(x)
+        return np.concatenate([one.violations(one.residual(self.space, y)) for one in self.constraints()
+                               if not self._is_own(one)])
 
     @cached_property
     def is_measured(self) -> bool:
