@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from formulations.state_space import factors, signals, state_space_fit
+from formulations.state_space import signals, state_space_fit
 from optid.bases import Bases
 from optid.core.problem import Problem
 from optid.core.terms import Errors
@@ -122,7 +122,7 @@ def _problem(name: str, errors: StateErrors, x: np.ndarray, constraints: Sequenc
         name,
         start=variables.values(x),
         terms=(Errors(variables.squares, variables.value, errors),),
-        leaves=factors(errors), further=partial(_signals, errors), about=frozenset({"P", "Q"}),
+        leaves=errors.factors(), further=partial(_signals, errors), about=frozenset({"P", "Q"}),
         model=partial(errors.model, constrained=bool(constraints)),
         facts={**facts, "iterate": True, "bases": facts["bases"] | {z: one.basis for z, one in latent.items()},
                "spans": {z: one.vectors for z, one in latent.items()}},

@@ -33,7 +33,6 @@ import numpy as np
 
 from formulations.constraints.poles import asks_for_integrator
 from optid.bases import Bases
-from optid.core.leaves import Product
 from optid.core.problem import Problem
 from optid.core.terms import Errors
 from optid.data.record import Data
@@ -155,8 +154,7 @@ def _problem(name: str, errors: TransferErrors, optimum: Array) -> Problem:
         name,
         start=variables.values(optimum),
         terms=(Errors(variables.squares, variables.value, errors),),
-        leaves=tuple(Product(errors.key("mu", c), errors.key("b", c), errors.gauge)
-                     for c, free in enumerate(errors.unknowns.free) if free),
+        leaves=errors.factors(errors.gauge),  # Theta = mu bᵀ
         further=partial(_signals, errors), model=errors.model, facts={"iterate": True, **errors.facts()},
         **errors.common())
 
@@ -166,11 +164,7 @@ def _signals(errors: TransferErrors, variables: Mapping[str, Any], _: Any) -> di
 
     States that contain the levels of the channels are not shown.
     """
-    unknowns, found = errors.unknowns, dict[str, Any]()
-    for c, free in enumerate(unknowns.free):
-        if not free:
-            b = variables[errors.key("b", c)]
-            found[errors.key("Theta", c)] = cp.reshape(b, (1, b.size), order="F")
+    unknowns, found = errors.unknowns, dict[str, Any](errors.linear_thetas(variables))
     if "offset" not in variables:
         found["offset"] = cp.Constant(np.zeros(1))
     states = variables.get("x0")

@@ -32,7 +32,6 @@ from formulations.constraints.poles import refuse_integrator
 from formulations.prediction_error import Orders
 from formulations.state_space import state_space_fit
 from optid.bases import Bases
-from optid.core.leaves import Product
 from optid.core.problem import Problem
 from optid.core.terms import Squares, Values
 from optid.data.record import Data
@@ -63,8 +62,7 @@ def _problem(name: str, courses: Courses, start: Values, constraints: Sequence[A
 
     return Problem(
         name, start, tuple(Squares(weights, measured, 0.0, (course,)) for course, weights, measured in outputs),
-        leaves=tuple(Product(errors.key("mu", c), errors.key("b", c), gauge="")
-                     for c, free in enumerate(errors.unknowns.free) if free),
+        leaves=errors.factors(),  # Theta = mu bᵀ
         restrictions=(equations,), builders=tuple(constraints), bounds=courses.limits(start),
         courses=names if courses.determined else frozenset(), further=courses.further, model=errors.model,
         facts={"reference": start, **errors.facts()}, compressed=courses.compressed, proof=NO_BOUND, **errors.common())

@@ -33,7 +33,6 @@ import numpy as np
 from formulations.constraints.poles import NO_EQUATION, refuse_integrator
 from formulations.hammerstein_ss import SUBSPACE
 from optid.bases import Bases
-from optid.core.leaves import Leaf, Product
 from optid.core.problem import Problem
 from optid.core.terms import Errors, Values
 from optid.data.record import Data
@@ -110,7 +109,7 @@ def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: 
 
 def _problem(name: str, errors: StateErrors, x: np.ndarray, constraints: Sequence[Any]) -> Problem:
     """Minimise ‖e‖² over A, [B; D] and f of every input, C, feedback and initial states, from x."""
-    variables, leaves = errors.variables, factors(errors)
+    variables, leaves = errors.variables, errors.factors()  # Theta = mu bᵀ
     if not errors.unknowns.expansion.feedback:
         leaves += tuple(static_curve(*(errors.key(word, c) for word in ("mu", "b", "static")))
                         for c in range(errors.data.m))
@@ -123,20 +122,10 @@ def _problem(name: str, errors: StateErrors, x: np.ndarray, constraints: Sequenc
         builders=tuple(constraints), **errors.common())
 
 
-def factors(errors: StateErrors) -> tuple[Leaf, ...]:
-    """Return ``Theta = mu bᵀ`` of every input whose f is unknown; the objective fixes no scale between them."""
-    return tuple(Product(errors.key("mu", c), errors.key("b", c), gauge="")
-                 for c, free in enumerate(errors.unknowns.free) if free)
-
-
 def signals(errors: StateErrors, variables: Mapping[str, Any], x: Values) -> dict[str, Any]:
     """Return what constraints may also use: P held and Q = A P, Theta of linear inputs, the mean of several levels."""
     unknowns, weight = errors.unknowns, modal_weight(x["A"])
-    found = {"P": cp.Constant(weight), "Q": variables["A"] @ weight}
-    for c, free in enumerate(unknowns.free):
-        if not free:
-            b = variables[errors.key("b", c)]
-            found[errors.key("Theta", c)] = cp.reshape(b, (1, b.size), order="F")
+    found = {"P": cp.Constant(weight), "Q": variables["A"] @ weight, **errors.linear_thetas(variables)}
     if unknowns.levels:
         states = cp.reshape(variables["x0"], (unknowns.memory, unknowns.experiments), order="F")
         found |= {"offset": cp.sum(states[unknowns.n :], axis=1) / unknowns.experiments, "x0": states[: unknowns.n]}

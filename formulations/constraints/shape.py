@@ -69,10 +69,7 @@ def convex(channel: str | None = None) -> Rule:
 
 @record_arguments
 def concave(channel: str | None = None) -> Rule:
-    """The nonlinearity, and the static characteristic with it, is concave over the interval of its basis.
-
-    As `convex`.
-    """
+    """The nonlinearity, and the static characteristic with it, is concave over its interval; otherwise as `convex`."""
     return _cone("concave", "", channel, lambda basis: -_smooth(basis, "concave").curvature(), heights=False)
 
 
@@ -109,10 +106,9 @@ def saturation(low: float | None = None, high: float | None = None, channel: str
     """The nonlinearity is constant below ``low`` and above ``high``.
 
     Raises:
-        StructureError: neither level given.
+        StructureError: neither level given, or levels that cross.
     """
-    if low is None and high is None:
-        raise StructureError("saturation needs a level: low=, high= or both")
+    check_bounds("saturation", low, high)
 
     def rows(basis: Any) -> np.ndarray:
         lo, hi = basis.interval
@@ -285,15 +281,10 @@ def slopes_at(basis: Any, at: float | None) -> np.ndarray:
 
 
 def _smooth(basis: Any, word: str) -> Any:
-    """Refuse a basis of steps for a rule about slopes."""
     if isinstance(basis, PiecewiseConstant):
         raise StructureError(f"{word!r} is about slopes, and a piecewise constant function has none: choose "
                              f"'triangular:{basis.p}', or bound its steps by monotone or range")
     return basis
-
-
-def _inputs(view: View, channel: str | None) -> Sequence[str]:
-    return view.channels if channel is None else [channel]
 
 
 def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray], heights: bool = True
@@ -304,24 +295,26 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
         if direction == "decreasing" and channel in view.spans:
             raise StructureError(f"the sign of {channel} is arbitrary, so that 'decreasing' and 'increasing' are "
                                  "equivalent: use 'increasing'")
+        inputs = view.channels if channel is None else [channel]
         found = [Limit(_rows(view, one, rows) @ curve >= 0, bound=one,
                        step=_range_of(view.basis(one), curve) if heights else None, words=RANGE if heights else "")
-                 for one in _inputs(view, channel) for curve in view.curves(one)]
-        ways: dict[str, Any] = {one: view.direction(one) for one in _inputs(view, channel)}
-        return found + [Limit(b >= 0, bound=f"direction of {one}") for one, b in ways.items()
-                        if b is not None]
+                 for one in inputs for curve in view.curves(one)]
+        ways: Any = [(one, view.direction(one)) for one in inputs]
+        return found + [Limit(b >= 0, bound=f"direction of {one}") for one, b in ways if b is not None]
 
     return Rule(label(f"{word}:{direction}" if direction else word, channel), build)
 
 
 def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
-    def limit(view: View, one: str) -> Limit:
-        whole, coefficients = _rows(view, one, rows), view.function(one)
-        matrix = _independent(whole)
-        return Limit(matrix @ coefficients == 0, band=whole, span=matrix, step=_range_of(view.basis(one), coefficients),
-                     words=RANGE)
+    def build(view: View) -> list[Limit]:
+        found = []
+        for one in view.channels if channel is None else [channel]:
+            whole, coefficients = _rows(view, one, rows), view.function(one)
+            matrix, step = _independent(whole), _range_of(view.basis(one), coefficients)
+            found.append(Limit(matrix @ coefficients == 0, band=whole, span=matrix, step=step, words=RANGE))
+        return found
 
-    return Rule(label(word, channel), lambda view: [limit(view, one) for one in _inputs(view, channel)])
+    return Rule(label(word, channel), build)
 
 
 def _rows(view: View, channel: str, rows: Callable[[Any], np.ndarray]) -> np.ndarray:

@@ -31,9 +31,8 @@ def run(problem: Problem, settings: Settings) -> Answer:
     allowed = 0.5 * tolerance(settings.accuracy)  # half of what the judgement allows
     found = minimise(form.problem, form.weight, allowed, int(dict(settings.options).get("limit", 20_000)))
     v, theta = found.point
-    misfit = np.sqrt(form.weight) * (v - form.problem.data)[form.problem.known]
-    duals = {"structure": -np.ravel(found.dual, order="F"), "residual": -2.0 * misfit}
-    return found.answer(allowed, {"yhat": v} | ({"T": theta} if form.problem.parameters else {}), duals)
+    return found.answer(allowed, {"yhat": v} | ({"T": theta} if form.problem.parameters else {}),
+                        {"structure": -np.ravel(found.dual, order="F")})
 
 
 def minimise(problem: NuclearProblem, weight: float, gap: float = 1e-7, limit: int = 20_000) -> Minimum:

@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from optid.backends.back_end import Answer, Settings
 from optid.backends.catalogue import WITHOUT_DUALS
 from optid.core.constraint import join_by_name
-from optid.core.leaves import Affine
+from optid.core.leaves import Affine, positions
 from optid.core.problem import Problem
 from optid.core.statement import statement_of
 from optid.core.terms import Squares
@@ -188,7 +188,7 @@ def _has_rows_alone(problem: Problem) -> bool:
         return False
     if problem.symmetric or not all(isinstance(leaf, Affine) for leaf in problem.leaves):
         return False
-    return problem.is_in_rows
+    return all(one.cone != "other" for one in problem.constraints())
 
 
 def sizes_by_effect(problem: Problem, matrix: np.ndarray) -> np.ndarray:
@@ -208,11 +208,10 @@ def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
     """Solve such a problem, in units in which the record accounts for every unknown."""
     (squares,) = problem.terms
     assert isinstance(squares, Squares)
-    places, slope = problem.slices, problem.slope(problem.start)
+    slope = problem.slope(problem.start)
     level = problem.space.vector(problem.leaf_values(problem.start)) - slope @ problem.pack(problem.start)
-    columns = np.concatenate([np.arange(places[name].start, places[name].stop) for name in squares.z])
     matrix = np.zeros((len(squares.root), problem.size))
-    matrix[:, columns] = squares.root
+    matrix[:, positions(problem.slices, squares.z)] = squares.root
     sizes = sizes_by_effect(problem, matrix)
     unit = max(float(np.max(np.abs(matrix * sizes))), np.finfo(float).tiny)
     held, units = sorted(problem.constraints(), key=lambda one: CONES.index(one.cone)), []
@@ -233,9 +232,6 @@ def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
     if not found.values:
         return found
     x = found.values["x"] if turn is None else turn @ found.values["x"]
-    x = problem.unpack(x * sizes)
     edges = np.cumsum([0, *map(len, held)])
     parts = [unit**2 * found.duals["rows"][a:b] / size for a, b, size in zip(edges, edges[1:], units)]
-    residual = squares.residual(problem.leaf_values(x))
-    return Answer(found.status, found.word, {**x, "residual": residual},
-                  {"residual": -2.0 * residual, **join_by_name(held, parts)}, found.iterations)
+    return Answer(found.status, found.word, problem.unpack(x * sizes), join_by_name(held, parts), found.iterations)

@@ -5,10 +5,8 @@ import numpy as np
 from optid.backends.back_end import Answer, Settings
 from optid.backends.rank_one_sqp import DIRECTIONS, RankOneSQP
 from optid.certificate.ladder import certify
-from optid.certificate.lifting import certify_rank_one
 from optid.core.least_squares import RankOneForm
 from optid.core.problem import Problem
-from optid.core.terms import Values
 from optid.models.gauges import gauge_factor
 from optid.program.solution import Status
 from optid.structures.bilinear import LocalSolution, minimise
@@ -28,27 +26,12 @@ def run(problem: Problem, settings: Settings) -> Answer:
     assert form is not None
     options = dict(settings.options)
     count, seed = int(options.get("starts", 8)), int(options.get("seed", 0))
-    if not problem.constraint_names:
-        found = _minimum(problem, form, count, seed)
-        r = form.problem.root @ found.point.lift() - form.problem.target
-        status, word = (Status.LOCAL, "stationary") if found.converged else (Status.LIMIT, "iteration limit")
-        return Answer(status, word, to_values(problem, form, found.point),
-                      {"residual": -2.0 * r, "gauge": np.zeros(len(form.blocks))}, found.iterations)
-    return _constrained(problem, _minimum(problem, form, count, seed).point, seed,
-                        int(options.get("directions", DIRECTIONS)), int(options.get("descents", DESCENTS)))
-
-
-def _constrained(problem: Problem, free: Point, seed: int, directions: int, descents: int) -> Answer:
-    """Solve the problem of the core that a programme states."""
-    def is_proved(x: Values) -> bool:
-        return certify_rank_one(problem, x, max_size=0)[0].proved
-
-    end = RankOneSQP(problem, problem.start, free, is_proved).solve(seed, directions, descents)
-    if not end.x:
-        return Answer(end.status, end.word, iterations=end.steps)
-    (squares,) = problem.bilinear_terms
-    residual = squares.residual(problem.leaf_values(end.x))
-    return Answer(end.status, end.word, end.x, {"residual": -2.0 * residual, **end.duals}, end.steps)
+    free = _minimum(problem, form, count, seed)
+    if problem.constraint_names:
+        return RankOneSQP(problem, form, free.point).solve(
+            seed, int(options.get("directions", DIRECTIONS)), int(options.get("descents", DESCENTS)))
+    status, word = (Status.LOCAL, "stationary") if free.converged else (Status.LIMIT, "iteration limit")
+    return Answer(status, word, to_values(problem, form, free.point), iterations=free.iterations)
 
 
 def _minimum(problem: Problem, form: RankOneForm, count: int, seed: int) -> LocalSolution:

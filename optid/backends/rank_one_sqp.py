@@ -5,14 +5,15 @@ by their tangents. A step for which the tangents are a poor model is corrected b
 convex.
 """
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.backends.back_end import Answer
 from optid.backends.conic import solve_least_squares
 from optid.backends.rank_one_step import TINY, RankOneStep
+from optid.certificate.lifting import certify_rank_one
 from optid.core.constraint import join_by_name
 from optid.core.least_squares import RankOneForm
 from optid.core.problem import Problem
@@ -28,39 +29,25 @@ INSIDE = 1e-14  # violation that is none
 MOST_SIGNED = 3  # blocks whose signs are all tried
 
 
-@dataclass(frozen=True, eq=False)
-class DescentEnd:
-    """Where a descent ended: merit, point, flat multipliers by constraint, and why."""
-
-    merit: float
-    x: dict[str, Array]
-    duals: dict[str, Array]
-    status: Status
-    word: str
-    steps: int
-
-
 class RankOneSQP:
     """The method on one problem.
 
     Args:
         problem: one term of squares with products, under constraints that do not depend on an iterate.
-        start: where to begin.
+        form: its numbers.
         free: the minimum without the constraints.
-        is_proved: whether a point is quickly proved to be the global minimum.
     """
 
-    def __init__(self, problem: Problem, start: Values, free: Point,
-                 is_proved: Callable[[Values], bool]) -> None:
-        self.problem, self.start, self.free, self.is_proved = problem, start, free, is_proved
-        form = RankOneForm.of(problem)
-        assert form is not None
-        self.form, self.lifted = form, form.problem
+    def __init__(self, problem: Problem, form: RankOneForm, free: Point) -> None:
+        self.problem, self.form, self.lifted, self.free = problem, form, form.problem, free
         self.model = RankOneStep(problem, self._values(free))
         self.products, self.squares, self.constraints = self.model.products, self.model.squares, self.model.constraints
 
-    def solve(self, seed: int, directions: int, descents: int) -> DescentEnd:
-        """Try directions of b, follow the best ones to their ends, and return the best end."""
+    def solve(self, seed: int, directions: int, descents: int) -> Answer:
+        """Try directions of b, follow the best ones to their ends, or to one that is quickly proved; return the best.
+
+        The multipliers are flat, by constraint.
+        """
         idle = self._idle()
         if idle is not None:
             return idle
@@ -70,7 +57,7 @@ class RankOneSQP:
             nearest = filter(None, map(self._allowed, points))
             settled = [found for found in map(self._settle, nearest) if found is not None]
         if not settled:
-            return DescentEnd(np.inf, {}, {}, Status.FAILED, "no start satisfies the constraints", 0)
+            return Answer(Status.FAILED, "no start satisfies the constraints", iterations=0)
         settled.sort(key=lambda pair: pair[0])
         distinct: list[dict[str, Array]] = []
         for _, x in settled:
@@ -80,16 +67,15 @@ class RankOneSQP:
         ends = []
         for x in distinct[:descents]:
             ends.append(self._descend(x))
-            if ends[-1].status is Status.LOCAL and self.is_proved(ends[-1].x):
+            end = ends[-1][1]
+            if end.status is Status.LOCAL and certify_rank_one(self.problem, end.values, max_size=0)[0].proved:
                 break
-        return min(ends, key=lambda end: end.merit)
+        return min(ends, key=lambda pair: pair[0])[1]
 
     # -- points
 
     def _values(self, point: Point) -> dict[str, Array]:
-        """Return the values of a point, in the gauge."""
-        shapes = {name: np.shape(value) for name, value in self.problem.start.items()}
-        return self.problem.in_gauge(self.form.unpack(point, shapes))
+        return self.problem.in_gauge(self.form.unpack(point, self.problem.shapes))
 
     def _lift(self, x: Values) -> Array:
         return self.form.point(x).lift()
@@ -97,7 +83,7 @@ class RankOneSQP:
     def _candidates(self, seed: int, most: int) -> list[dict[str, Array]]:
         """Points with different directions of b, each with every pattern of signs."""
         core, free = self.lifted.core, self.free
-        points = [self.form.point(self.start)]
+        points = [self.form.point(self.problem.start)]
         if most > DIRECTIONS:  # under signs of b an optimum may lie on one lag alone, and mu vanish all around it
             points = [Point(free.w, free.mus, (*free.bs[:i], axis, *free.bs[i + 1 :]))
                       for i, b in enumerate(free.bs) for axis in np.eye(b.size)] + points
@@ -109,13 +95,13 @@ class RankOneSQP:
                 distinct.append(Point(point.w, point.mus, directions))
         return [self._values(one) for point in distinct[:most] for one in sign_patterns(point)]
 
-    def _idle(self) -> DescentEnd | None:
+    def _idle(self) -> Answer | None:
         """Return the minimum without the constraints, where it satisfies them with one of its signs."""
         for point in sign_patterns(self.free):
             x = self._values(point)
             if self.problem.violation(x, self.constraints) <= INSIDE and self._in_gauge(x):
                 duals = join_by_name(self.constraints, [np.zeros(len(one)) for one in self.constraints])
-                return DescentEnd(0.0, x, duals, Status.LOCAL, "stationary; no constraint is active", 0)
+                return Answer(Status.LOCAL, "stationary; no constraint is active", x, duals, 0)
         return None
 
     def _in_gauge(self, x: Values) -> bool:
@@ -164,8 +150,8 @@ class RankOneSQP:
         value = float(residual @ residual)
         return value + weight * self.problem.violation(x, self.model.bent) if weight and self.model.bent else value
 
-    def _descend(self, x: dict[str, Array]) -> DescentEnd:
-        """Follow the steps from x to their end."""
+    def _descend(self, x: dict[str, Array]) -> tuple[float, Answer]:
+        """Follow the steps from x to their end; first its merit."""
         scale = self.lifted.scale
         weight, damping, floor = 1e-3 * scale + TINY, 0.0, 1e-9 * scale
         duals: dict[str, Array] = {}
@@ -196,7 +182,7 @@ class RankOneSQP:
             x, damping = new, 0.1 * damping if damping > 1e-9 else 0.0
             if size < 1e-9 or (size < 1e-7 and before - after <= 1e-13 * (before + floor)):
                 status, word = Status.LOCAL, "stationary"
-        return DescentEnd(self._merit(x, weight), x, duals, status, word, count)
+        return self._merit(x, weight), Answer(status, word, x, duals, count)
 
 
 def sign_patterns(point: Point) -> Iterator[Point]:

@@ -12,7 +12,6 @@ from functools import cached_property
 
 import cvxpy as cp
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
@@ -20,12 +19,11 @@ from optid.backends.back_end import Answer, Settings
 from optid.backends.conic import SHARP, sizes_by_effect, solve_least_squares, tolerances
 from optid.core.constraint import Constraint, join_by_name
 from optid.core.judge import gauges
-from optid.core.leaves import Product
+from optid.core.leaves import GAUGE, Product, positions
 from optid.core.problem import Problem
 from optid.core.terms import Values, flat
 from optid.program.expressions import solve_quietly
 from optid.program.limits import EQUALITIES
-from optid.program.sizes import GAUGE
 from optid.program.solution import Status
 
 TINY = 1e-300
@@ -42,6 +40,7 @@ class RankOneStep:
     def __init__(self, problem: Problem, usual: Values) -> None:
         self.problem, self.usual = problem, usual
         (self.squares,) = problem.bilinear_terms
+        self._z = positions(problem.space.places, self.squares.z)
         self.constraints = tuple(sorted(problem.constraints(), key=lambda one: one.cone != "zero"))
         # in the order of the sides of a programme: equalities, inequalities, and what CVXPY alone states
         self.tangents = tuple(sorted((one for one in self.constraints if not _convex(one)), key=_is_below))
@@ -57,22 +56,14 @@ class RankOneStep:
     @cached_property
     def bent(self) -> tuple[Constraint, ...]:
         """The constraints about products, or by their tangents alone."""
-        space = self.problem.space
-        places = [space.places[product.name] for product in self.products]
-        thetas = {space.variables[product.name].id for product in self.products} if self.convex else set()
-        return tuple(one for one in self.constraints if any(one.rows[:, place].any() for place in places)
-                     or one.cone == "other" and not _convex(one)
-                     or _convex(one) and thetas & {variable.id for variable in one.limit.member.variables()})
+        names = {product.name for product in self.products}
+        return tuple(one for one in self.constraints if one.cone == "other" and not _convex(one)
+                     or one.leaves(self.problem.space) & names)
 
     @cached_property
     def sizes(self) -> Array:
         """Units of the unknowns (unknowns,), by their effect."""
         return sizes_by_effect(self.problem, self._jacobian(self.problem.slope(self.usual)))
-
-    @cached_property
-    def _z(self) -> NDArray[np.intp]:
-        places = self.problem.space.places
-        return np.concatenate([np.arange(places[name].start, places[name].stop) for name in self.squares.z])
 
     def _jacobian(self, slope: Array) -> Array:
         return self.squares.root @ slope[self._z]
@@ -104,8 +95,7 @@ class RankOneStep:
         descent = solve_triangular(factor, jacobian.T @ residual / scale, lower=True)
         sides: dict[str, list[tuple[Array, Array]]] = {"zero": [], "below": []}
         if pinned:
-            bs = np.concatenate([np.arange(problem.slices[one.b].start, problem.slices[one.b].stop)
-                                 for one in self.products])
+            bs = positions(problem.slices, [one.b for one in self.products])
             sides["zero"].append((np.eye(problem.size)[bs], at[bs] / sizes[bs]))
         else:
             for (gauge, _), product in zip(gauges(problem, x), problem.products):

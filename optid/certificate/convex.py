@@ -20,10 +20,10 @@ from optid.certificate.lifting import lift
 from optid.core.constraint import join_by_name
 from optid.core.judge import in_dual_cone, rows_at
 from optid.core.least_squares import LeastSquaresForm, LinearForm
+from optid.core.leaves import variable_size
 from optid.core.problem import Problem
 from optid.core.terms import Values, flat
 from optid.program.expressions import differences
-from optid.program.sizes import variable_size
 from optid.program.solution import Bound, relative_gap
 from optid.structures.multipliers import least_distance
 
@@ -127,7 +127,7 @@ def _free(problem: Problem, x: Values, name: str, gradient: Array) -> Array:
 
 
 def _width(value: Array) -> float:
-    return REACH * variable_size(value, None)
+    return REACH * variable_size(value)
 
 
 def _descent(problem: Problem, x: Values, name: str, gradient: Array) -> float:

@@ -14,14 +14,7 @@ import numpy as np
 
 from optid.certificate.minors import Block, Quadratic, ascend, free_mask, project_minors, rotation, tangent_minors
 from optid.certificate.sdp import relax, relaxation_size
-from optid.certificate.shape_duals import (
-    ACTIVE,
-    LinearRows,
-    align_cuts,
-    check_constraints,
-    kkt_multipliers,
-    sign_free_cut,
-)
+from optid.certificate.shape_duals import ACTIVE, LinearRows, align_cuts, kkt_multipliers, sign_free_cut
 from optid.errors import StructureError
 from optid.program.solution import Bound, relative_gap
 from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
@@ -129,7 +122,7 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
         The bound and, after an SDP that did not prove the point, points to restart from.
 
     Raises:
-        StructureError: constraints of a wrong shape, an unknown effort.
+        StructureError: an unknown effort.
     """
     if effort not in EFFORTS:
         raise StructureError(f"effort must be one of {EFFORTS}, not {effort!r}")
@@ -153,7 +146,6 @@ def _remembered(problem: RankOne, point: Point, effort: str, steps: int, max_siz
 def _climb(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: LinearRows, effort: str, steps: int,
            max_size: int) -> Certification:
     """Certify rung by rung, up to the last one requested or the first that proves the point."""
-    check_constraints(cones, linear, problem)
     case = prepare(problem, point, cones, linear)
     if not case.core.shapes and not len(linear.right):
         return conclude(case, "exact", "linear least squares", case.objective.gram, {})

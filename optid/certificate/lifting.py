@@ -12,6 +12,7 @@ import numpy as np
 from optid.certificate.ladder import certify
 from optid.certificate.shape_duals import LinearRows
 from optid.core.least_squares import LeastSquaresForm, RankOneForm
+from optid.core.leaves import positions
 from optid.core.problem import Problem
 from optid.core.terms import Squares, Values
 from optid.program.solution import Bound, relative_gap
@@ -96,7 +97,7 @@ def lift(problem: Problem, form: LeastSquaresForm, names: Collection[str] | None
         return Lifted(LinearRows.none(len(form.problem.target)))
     (squares,) = (term for term in problem.terms if isinstance(term, Squares))
     space, names = problem.space, set(squares.z)
-    where = np.concatenate([np.arange(space.places[name].start, space.places[name].stop) for name in squares.z])
+    where = positions(space.places, squares.z)
     factors = {name: (i, name == pair[0]) for i, pair in enumerate(form.blocks) for name in pair}
     lifted = Lifted(LinearRows.none(len(form.problem.target)))
     for one in held:

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from optid.errors import StructureError
 from optid.structures.multipliers import fit_multipliers
-from optid.structures.rank_one import Array, Point, RankOne
+from optid.structures.rank_one import Array, Point
 
 ACTIVE = 1e-6  # a row counts as active when its slack is below this fraction of the size of its terms
 
@@ -35,21 +34,6 @@ class LinearRows:
     def none(cls, n: int) -> "LinearRows":
         """No constraints on n unknowns."""
         return cls(np.zeros((0, n)), np.zeros(0), np.zeros(0, dtype=bool))
-
-
-def check_constraints(cones: Mapping[int, Array], linear: LinearRows, problem: RankOne) -> None:
-    """Refuse constraints whose shapes do not fit the problem.
-
-    Raises:
-        StructureError: constraints that are not on the lifted vector, or a matrix C_i whose width is not P_i.
-    """
-    n, r = len(problem.target), linear.rows.shape[:1]
-    if linear.rows.shape != (*r, n) or linear.right.shape != r or linear.equality.shape != r:
-        raise StructureError(f"linear constraints need E (r, {n}), f (r,) and an equality mask (r,), not "
-                             f"{linear.rows.shape}, {linear.right.shape}, {linear.equality.shape}")
-    for i, cone in cones.items():
-        if not 0 <= i < len(problem.blocks) or cone.ndim != 2 or cone.shape[1] != problem.blocks[i][0]:
-            raise StructureError(f"cone {i} has shape {cone.shape}; block {i} of {problem.blocks} needs (r, P)")
 
 
 def kkt_multipliers(slope: Array, point: Point, cones: Mapping[int, Array], linear: LinearRows

@@ -41,7 +41,6 @@ class Constraint:
         expression: of an "other" one what it holds at zero or not above it; None for a cone that is not read.
         moving: whether its builder looked at values of an iterate.
         builder: position of its builder.
-        position: of it in its group.
         first: its first row among those of its group.
     """
 
@@ -52,7 +51,6 @@ class Constraint:
     right: Array
     moving: bool
     builder: int
-    position: int = 0
     first: int = 0
     expression: Any = None
 
@@ -114,21 +112,22 @@ class Constraint:
         return space.rows({names[one.id]: sp.diags_array(1 / self.sizes) @ part for one, part in parts.items()
                            if one.id in names}, len(self))
 
-    def violation(self, space: LeafSpace, y: Values) -> float:
-        """Return the sum of the violations of its rows, or the largest one of a matrix."""
-        g = self.residual(space, y)
-        if self.is_equality:
-            return float(np.sum(np.abs(g)))
+    def violations(self, g: Array) -> Array:
+        """Return by how much every row is violated where it has the value g (m,); of a matrix one number."""
         if self.cone == "psd":
-            return largest_eigenvalue(g)
-        return float(np.sum(np.maximum(g, 0.0)))
+            return np.array([largest_eigenvalue(g)])
+        return np.abs(g) if self.is_equality else np.maximum(g, 0.0)
+
+    def violation(self, space: LeafSpace, y: Values) -> float:
+        """Return the sum of the violations at values of the leaves."""
+        return float(np.sum(self.violations(self.residual(space, y))))
 
 
 def join_by_name(constraints: Sequence[Constraint], parts: Sequence[Array]) -> dict[str, Array]:
     """Join the multipliers of the members of every group, in the order in which these were stated."""
     found: dict[str, list[tuple[int, Array]]] = {}
     for one, part in zip(constraints, parts):
-        found.setdefault(one.name, []).append((one.position, part))
+        found.setdefault(one.name, []).append((one.first, part))
     return {name: np.concatenate([part for _, part in sorted(several, key=lambda pair: pair[0])])
             for name, several in found.items()}
 
@@ -158,16 +157,6 @@ class Reference(dict[str, Array]):
         """Return a value."""
         self.asked = True
         return super().get(key, default)
-
-
-class _NotingView(View):
-    """A view that notes which expressions a constraint asks for."""
-
-    asked: set[str]
-
-    def __getitem__(self, name: str) -> Any:
-        self.asked.add(name)
-        return super().__getitem__(name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,24 +192,24 @@ class ConstraintReader:
             StructureError: an unknown variable, a name used twice, a constraint that is not convex but has to be.
         """
         reference = Reference(self.facts.get("reference", about))
-        view = _NotingView(shown, **{**self.facts, "reference": reference})
+        view = View(shown, **{**self.facts, "reference": reference})
         found: list[Constraint] = []
         convex = self.convex
         for number, builder in enumerate((*own, *builders)):
             if only is not None and number not in only:
                 continue
-            reference.asked, view.asked = False, set()
+            reference.asked = False
             default = getattr(builder, "name", None) or f"constraint {number - len(own) + 1}"
             built = name_limits(builder(view) if callable(builder) else builder, default)
-            moving = reference.asked and "reference" not in self.facts or bool(view.asked & self.about)
+            moving = view.was_asked(self.about) or reference.asked and "reference" not in self.facts
             for name, limits in built.items():
                 if any(one.name == name and one.builder != number for one in found):
                     raise StructureError(f"there are two constraints named {name!r}; give each its own name")
                 first = 0
-                # a straight line has no curvature
-                for position, limit in enumerate(limit for limit in limits if limit.member.size):
-                    read = self._rows(view, name, limit, moving, number, number < len(own))
-                    one = replace(read, position=position, first=first)
+                for limit in limits:
+                    if not limit.member.size:  # a straight line has no curvature
+                        continue
+                    one = replace(self._rows(view, name, limit, moving, number, number < len(own)), first=first)
                     if number < len(own):
                         convex = convex and (one.cone != "other" or limit.member.is_dcp())
                     elif convex:

@@ -14,11 +14,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.arrays import Array, largest
-from optid.core.constraint import Constraint, join_by_name, largest_eigenvalue, symmetric_part
-from optid.core.leaves import LeafSpace
+from optid.core.constraint import Constraint, join_by_name, symmetric_part
+from optid.core.leaves import LeafSpace, positions, variable_size
 from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, Length, NuclearNorms, Values, flat
-from optid.program.sizes import relative_gradient, variable_size
 from optid.program.solution import Residuals
 from optid.structures.multipliers import fit_multipliers
 
@@ -163,11 +162,7 @@ def largest_excess(problem: Problem, x: Values, unknowns: frozenset[str] = froze
 
 def _excess(one: Constraint, g: Array) -> float:
     """Return the largest violation of a row, in its own units, or of a matrix; infinite where it is not finite."""
-    if not np.all(np.isfinite(g)):
-        return float("inf")
-    if one.cone == "psd":
-        return largest_eigenvalue(g)
-    return float(np.max(np.abs(g) if one.is_equality else np.maximum(g, 0.0), initial=0.0))
+    return float(np.max(one.violations(g), initial=0.0)) if np.all(np.isfinite(g)) else float("inf")
 
 
 def sizes_of_terms(one: Constraint, rows: Any, g: Array, space: LeafSpace, y: Values) -> tuple[float, float]:
@@ -235,8 +230,9 @@ class LagrangianAtPoint:
         rates = []
         for name, place in problem.slices.items():
             part, effort = self._free_part(name, total[place], terms[place])
-            size = variable_size(self.x[name], problem.space.usual_sizes.get(name))
-            rates.append((relative_gradient(np.abs(part), effort, self.yardstick, size), name))
+            # relative to the terms it is a sum of, and to the objective per size of the unknown
+            floor = effort + self.yardstick / variable_size(self.x[name], problem.space.usual_sizes.get(name))
+            rates.append((float(np.max(np.abs(part) / np.where(floor > 0, floor, 1.0), initial=0.0)), name))
         # relative to a hundredth of the zero model's objective where the objective vanishes
         return largest(rates)[0], products / max(abs(self.value), 1e-2 * problem.scale, np.finfo(float).tiny)
 
@@ -259,8 +255,7 @@ class LagrangianAtPoint:
         for term in self.problem.terms:
             if isinstance(term, Length) and set(term.z) <= self.problem.slices.keys():
                 slope = np.zeros((len(term.target), self.problem.size))
-                places = [np.arange(self.problem.size)[self.problem.slices[name]] for name in term.z]
-                slope[:, np.concatenate(places)] = term.root
+                slope[:, positions(self.problem.slices, term.z)] = term.root
                 found += term.ease(self.x, self._symmetric(slope), self._symmetric(total), NOTHING * self.yardstick)
         return found
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.core.form import Form
+from optid.core.leaves import GAUGE
 from optid.core.problem import Problem
 from optid.core.terms import Squares
-from optid.program.sizes import GAUGE
 from optid.structures.rank_one import Point, RankOne
 
 

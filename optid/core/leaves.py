@@ -4,7 +4,7 @@ Every leaf is its own CVXPY variable in the words of the user, so that a constra
 affine; its values and slopes in the unknowns follow by the chain rule.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,11 +13,14 @@ import cvxpy as cp
 import numpy as np
 import scipy.sparse as sp
 from cvxpy.lin_ops.lin_utils import ID_COUNTER, get_id
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.core.terms import Values, flat
 
 DENSE = 1_000_000  # entries of a matrix up to which it is an array
+GAUGE = "gauge"  # of the constraints that fix the scale between the factors of products, which no objective sees
+ZERO = 1e-9  # an unknown without a start that is smaller than this has no size to measure by
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,11 @@ class Product:
         if self.gauge == "norm":
             return cp.sum_squares(b) == 1
         return b[0] == 1 if self.gauge == "b0" else cp.sum(b) == 1 + (cp.sum(v["a"]) if "a" in v else 0)
+
+    def tangent(self, v: Mapping[str, cp.Expression], x: Values) -> Any:
+        """Return the gauge to first order about a point."""
+        level, parts = self.level(x)
+        return level + sum(part @ (cp.vec(v[name], order="F") - flat(x[name])) for name, part in parts.items()) == 0
 
     def in_gauge(self, x: Values) -> dict[str, Array]:
         """Return the point with the same product in the gauge; as it is where that is not possible."""
@@ -138,9 +146,7 @@ class Affine:
         """Return the derivative, which is the same everywhere."""
         return self.slopes
 
-    def chain(self, pull: Array, x: Values) -> dict[str, Array]:
-        """Return ``slopesᵀ pull``."""
-        return {name: part.T @ pull for name, part in self.slopes.items()}
+    chain = Quantity.chain
 
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the quantity in CVXPY expressions of the unknowns."""
@@ -224,7 +230,18 @@ class LeafSpace(OwnNumbers):
         return np.concatenate([flat(y[name]) for name in self.start])
 
 
+def variable_size(value: Array, usual: float | None = None) -> float:
+    """Return the largest entry of a value or of its start; one where there is no start and nothing but rounding."""
+    size = float(np.max(np.abs(value), initial=0.0))
+    return max(size, usual) if usual is not None else size if size > ZERO else 1.0
+
+
 def slices_of(values: Values) -> dict[str, slice]:
     """Return where every value is among all, one after another."""
     edges = np.cumsum([0, *(np.size(value) for value in values.values())]).tolist()
     return {name: slice(a, b) for name, a, b in zip(values, edges, edges[1:])}
+
+
+def positions(places: Mapping[str, slice], names: Iterable[str]) -> NDArray[np.intp]:
+    """Return where the entries of named values are, one after another."""
+    return np.concatenate([np.arange(places[name].start, places[name].stop) for name in names])

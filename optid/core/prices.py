@@ -72,10 +72,10 @@ def price_constraints(problem: Problem, x: Values, duals: Mapping[str, Array], o
         group = [row for row in rows if row.constraint.name == name]
         gaps = [_slacks(row) for row in group]
         active = sum(int(np.count_nonzero(gap <= ACTIVE * row.size_in_words)) for row, gap in zip(group, gaps))
-        limits = tuple(row.constraint.limit for row in group)
+        limits, places = [row.constraint.limit for row in group], [row.constraint.span for row in group]
         steps = [0.01 * row.size_in_words if limit.step is None else limit.step() for row, limit in zip(group, limits)]
         choose = None if exchange is None else partial(exchange, name)
-        slope, chosen = slope_of(limits, steps, duals[name], choose) if name in duals else (np.nan, 0)
+        slope, chosen = slope_of(limits, places, steps, duals[name], choose) if name in duals else (np.nan, 0)
         slope = slope if active or not np.isfinite(slope) else 0.0  # what a solver left on rows that hold nothing
         found.append(Price(
             name, active, sum(gap.size for gap in gaps),

@@ -1,20 +1,18 @@
 """A problem: unknowns with a start, terms of the objective, leaves and constraints; values and slopes without CVXPY."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 import scipy.sparse as sp
 
 from optid.arrays import Array
 from optid.core.constraint import Constraint, ConstraintReader
-from optid.core.leaves import DENSE, Affine, Leaf, LeafSpace, Product, slices_of
+from optid.core.leaves import DENSE, GAUGE, Affine, Leaf, LeafSpace, Product, positions, slices_of
 from optid.core.terms import Errors, Expressed, Squares, Term, Values, flat
 from optid.errors import StructureError, nearest
-from optid.program.sizes import GAUGE
 from optid.program.solution import Bound
 from optid.program.view import View
 
@@ -108,23 +106,18 @@ class Problem:
         Its constraints are those of this problem, read about the point where they move; one that is not convex in the
         leaves is a `StructureError`.
         """
-        gauges = tuple(product.level(x) for product in self.gauged)
-        if gauges and GAUGE in self.constraint_names:
-            raise StructureError(f"there are two constraints named {GAUGE!r}; give each its own name")
-
-        def gauge(view: Any) -> dict[str, Any]:
-            return {GAUGE: [level + sum(part @ (cp.vec(view.inner[name], order="F") - flat(x[name]))
-                                        for name, part in parts.items()) == 0 for level, parts in gauges]}
-
+        gauges = (self.gauges_about(x),) if self.gauged else ()
         step = replace(
             self, start=x, terms=(squares,), leaves=tuple(Affine.of(leaf, x) for leaf in self.leaves),
-            restrictions=((gauge,) if gauges else ()) + self.restrictions, compressed=compressed, step=True)
-        vars(step)["space"] = self.space  # the same leaves of the same usual sizes, in which constraints are read
-        held = [replace(one, moving=False, builder=one.builder + bool(gauges)) for one in self.constraints(x)]
+            restrictions=gauges + self.restrictions, compressed=compressed, step=True)
+        held = [replace(one, moving=False) for one in self.constraints(x)]
         for one in held:
             one.refuse_nonconvex(self.name)
-        vars(step)["_at_start"] = (*(step._read(x, {0}) if gauges else ()), *held)
-        return step
+        return self._shared_with(step, x, len(gauges), held)
+
+    def gauges_about(self, x: Values) -> Callable[[View], dict[str, Any]]:
+        """Return the builder of the gauges of all products to first order about a point."""
+        return lambda view: {GAUGE: [product.tangent(view.inner, x) for product in self.gauged]}
 
     def holding(self, x: Values, names: Collection[str], *more: Any) -> "Problem":
         """Return the problem in the other unknowns, with some held at their values in a point, and more restrictions.
@@ -137,10 +130,8 @@ class Problem:
             if np.shape(x[name]) != np.shape(self.start[name]):
                 raise StructureError(f"{name!r} has shape {np.shape(self.start[name])}, the value given has "
                                      f"{np.shape(x[name])}")
-        leaves = []
-        for leaf in self.leaves:
-            slopes = {name: part for name, part in leaf.slope(x).items() if name not in names}
-            leaves.append(Affine(leaf.name, leaf.value(x), slopes, x))
+        leaves = [Affine(leaf.name, leaf.value(x), {name: part for name, part in leaf.slope(x).items()
+                                                    if name not in names}, x) for leaf in self.leaves]
         held = [Affine(name, np.asarray(x[name], dtype=float), {}, x) for name in names]
         part = replace(self, start={name: x[name] for name in self.start if name not in names},
                        leaves=(*held, *leaves), restrictions=(*more, *self.restrictions),
@@ -149,17 +140,17 @@ class Problem:
         left, slope = part.pack(part.start), part.slope(part.start)
         terms = []
         for term in self.terms:
-            root = term.root @ slope[np.concatenate([np.arange(self.space.size)[self.space.places[n]] for n in term.z])]
+            root = term.root @ slope[positions(self.space.places, term.z)]
             terms.append(Squares(root, root @ left - term.residual(self.leaf_values(x)), term.remainder,
                                  tuple(part.start)))
-        part = replace(part, terms=tuple(terms))
-        vars(part)["space"] = self.space
-        own = part._read(x, set(range(len(more)))) if more else []
-        vars(part)["_at_start"] = (
-            *own, *(replace(one, builder=one.builder + len(more)) for one in self.constraints(x)))
-        return part
+        return self._shared_with(replace(part, terms=tuple(terms)), x, len(more), self.constraints(x))
 
-    # -- what it is made of
+    def _shared_with(self, made: "Problem", x: Values, own: int, held: Iterable[Constraint]) -> "Problem":
+        """Return a problem made of this one, in whose leaves constraints were read, behind its own first ones."""
+        vars(made)["space"] = self.space  # the same leaves of the same usual sizes
+        vars(made)["_at_start"] = (*(made._read(x, set(range(own))) if own else ()),
+                                   *(replace(one, builder=one.builder + own) for one in held))
+        return made
 
     @cached_property
     def products(self) -> tuple[Product, ...]:
@@ -183,8 +174,6 @@ class Problem:
         return not self.bilinear_terms and not any(
             isinstance(term, Errors) or isinstance(term, Expressed) and not term.build(self.space.variables).is_convex()
             for term in self.terms)
-
-    # -- layout
 
     @cached_property
     def slices(self) -> dict[str, slice]:
@@ -242,8 +231,6 @@ class Problem:
         view = View(self.expressions(self.space.variables, x), **{"reference": x, **self.facts})
         return {name: np.asarray(expression.value, dtype=float) for name, expression in view.items()}
 
-    # -- values and slopes
-
     def value(self, x: Values) -> float:
         """Return the objective, in the units of the problem."""
         y = self.leaf_values(x)
@@ -292,15 +279,16 @@ class Problem:
                 found[self.space.places[leaf.name], self.slices[name]] = part
         return found
 
-    # -- constraints
-
     def _read(self, x: Values, only: set[int] | None = None) -> list[Constraint]:
         reader = ConstraintReader(self.name, self.space, self.facts, self.has_convex_terms, self.about)
         return reader.read(self.restrictions, self.builders, x, self.expressions(self.space.variables, x), only)
 
     @cached_property
     def _at_start(self) -> tuple[Constraint, ...]:
-        return tuple(self._read(self.start)) if self.restrictions or self.builders else ()
+        held = tuple(self._read(self.start)) if self.restrictions or self.builders else ()
+        if self.gauged and any(one.name == GAUGE for one in held):
+            raise StructureError(f"there are two constraints named {GAUGE!r}; give each its own name")
+        return held
 
     @cached_property
     def _read_about(self) -> dict[bytes, tuple[Constraint, ...]]:
@@ -371,14 +359,9 @@ class Problem:
 
     def _violations(self, x: Values) -> Array:
         """Return the violation of every row (of a matrix: the largest) of the user's constraints at a point."""
-        y, found = self.leaf_values(x), []
-        for one in self.constraints():
-            if self._is_own(one):
-                continue
-            g = one.residual(self.space, y)
-            found.append(np.array([one.violation(self.space, y)]) if one.cone in ("psd", "other") else
-                         np.abs(g) if one.is_equality else np.maximum(g, 0.0))
-        return np.concatenate(found)
+        y = self.leaf_values(x)
+        return np.concatenate([one.violations(one.residual(self.space, y)) for one in self.constraints()
+                               if not self._is_own(one)])
 
     @cached_property
     def is_measured(self) -> bool:
@@ -388,11 +371,6 @@ class Problem:
         """
         return all(one.is_smooth for one in self._at_start) and all(
             hasattr(term, "pull") or hasattr(term, "nearest") for term in self.terms)
-
-    @cached_property
-    def is_in_rows(self) -> bool:
-        """Whether every constraint is read into rows or a matrix."""
-        return all(one.cone != "other" for one in self._at_start)
 
     def violation(self, x: Values, constraints: tuple[Constraint, ...] | None = None) -> float:
         """Return the sum of the violations at a point, of rows divided by their sizes."""

@@ -9,12 +9,11 @@ import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
 
-from optid.core.leaves import Affine, OwnNumbers, Product
+from optid.core.leaves import GAUGE, Affine, OwnNumbers, Product
 from optid.core.low_rank import LowRank
 from optid.core.problem import Problem
 from optid.core.terms import Squares, Values, stacked_expression, sum_of
 from optid.errors import StructureError
-from optid.program.sizes import GAUGE
 from optid.program.view import View
 
 AFFINE = frozenset({"zero", "below"})  # cones of constraints that are rows
@@ -147,12 +146,9 @@ def is_stated(problem: Problem) -> bool:
 def for_solvers(problem: Problem) -> Problem:
     """Return a problem with all its unknowns, and with one sum of squares where there are several.
 
-    Raises:
-        StructureError: constraints that do not fit.
+    Constraints that do not fit are refused (`StructureError`).
     """
     problem = problem.complete
-    if problem.gauged and any(one.name == GAUGE for one in problem.constraints()):
-        raise StructureError(f"there are two constraints named {GAUGE!r}; give each its own name")
     if len(problem.terms) > 1 and not problem.products and all(map(is_dense, problem.terms)):  # one triangle says so
         sizes = {name: place.stop - place.start for name, place in problem.space.places.items()}
         return problem.with_terms(Squares.of_sum(problem.terms, sizes))

@@ -98,21 +98,15 @@ def _limit(name: str, member: Any) -> Limit:
     return member if isinstance(member, Limit) else Limit.of(member)
 
 
-def spans(group: Sequence[Constraint]) -> list[slice]:
-    """Return the places of every member in the flat multipliers of its group."""
-    edges = np.cumsum([0, *(sum(dual.size for dual in member.dual_variables) for member in group)])
-    return [slice(int(a), int(b)) for a, b in zip(edges, edges[1:])]
-
-
-def slope_of(limits: tuple[Limit, ...], steps: Sequence[float], multipliers: np.ndarray,
+def slope_of(limits: Sequence[Limit], places: Sequence[slice], steps: Sequence[float], multipliers: np.ndarray,
              least: Callable[[np.ndarray], np.ndarray] | None = None) -> tuple[float, int]:
     """Return the derivative of the objective by the most expensive bound of a constraint, and its limit's position.
 
     Bounds are compared by what a small step of each gains. The multipliers are those of the rows as they are scaled,
-    flat over the members, per unit of the objective; `least` returns, for an effect of them, others with the least.
+    flat, each limit in its place, per unit of the objective; `least` returns, for an effect of them, others with the
+    least.
     """
-    totals, places = {}, spans([limit.member for limit in limits])
-    effects: dict[Any, np.ndarray] = {}
+    totals, effects = {}, dict[Any, np.ndarray]()
     for limit, span in zip(limits, places) if least is not None else ():
         if limit.bound is not None and limit.band is None and isinstance(limit.member, EQUALITIES | INEQUALITIES):
             effects.setdefault(limit.bound, np.zeros_like(multipliers))[span] = limit.speeds() / limit.sizes

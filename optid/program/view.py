@@ -56,6 +56,7 @@ class View(Mapping[str, cp.Expression]):
     iterate: bool = False
     delays: Mapping[str, int] = field(default_factory=dict)
     _auxiliaries: set[int] = field(default_factory=set, init=False)
+    _asked: set[str] = field(default_factory=set, init=False)
 
     @cached_property
     def _expressions(self) -> Mapping[str, cp.Expression]:
@@ -64,6 +65,7 @@ class View(Mapping[str, cp.Expression]):
         return outward(self)
 
     def __getitem__(self, name: str) -> cp.Expression:
+        self._asked.add(name)
         try:
             return self._expressions[name]
         except KeyError:
@@ -97,6 +99,12 @@ class View(Mapping[str, cp.Expression]):
         made = View(inner, **facts)
         made._auxiliaries = self._auxiliaries
         return made
+
+    def was_asked(self, names: frozenset[str]) -> bool:
+        """Whether one of these expressions was looked at since the last such question."""
+        found = not names.isdisjoint(self._asked)
+        self._asked.clear()
+        return found
 
     def owns(self, variable: cp.Variable) -> bool:
         """Whether a variable came from `auxiliary`."""

@@ -1,23 +1,17 @@
 """Alternating convex half-steps for bilinear problems: hold every b and solve for the rest, then hold every mu.
 
 Each half-step is a convex problem made by `Problem.holding`. The value never increases; convergence is linear and to a
-point that is stationary in each half (for a smooth objective: stationary). In the norm gauge the half-step in b keeps
-``bᵀ b_previous = 1``, which holds the scale to first order, so that constraints on mu that are not scale-free stay
-meaningful; b is normalised afterwards.
+point that is stationary in each half (for a smooth objective: stationary). The half-step in b holds the gauge to first
+order, so that constraints on mu that are not scale-free stay meaningful; in the norm gauge b is normalised afterwards.
 """
 
 from dataclasses import replace
-from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from optid.backends.back_end import Answer, Settings
 from optid.core.least_squares import RankOneForm
-from optid.core.leaves import Product
 from optid.core.problem import Problem
-from optid.core.terms import Values, flat
-from optid.program.sizes import GAUGE
 from optid.program.solution import Solution, Status
 from optid.solving.solve import solve
 
@@ -48,13 +42,10 @@ def run(problem: Problem, settings: Settings) -> Answer:
         if not in_mu.has_point:
             return _stopped(in_mu, last, count)
         point |= {name: in_mu.values[name] for name in point if name not in bs}
-        in_b = solve(_half_in_b(problem, point, mus), inner, accuracy=accuracy, prove=False)
+        in_b = solve(problem.holding(point, mus, problem.gauges_about(point)), inner, accuracy=accuracy, prove=False)
         if not in_b.has_point:
             return _stopped(in_b, last, count)
-        duals = {**in_b.duals, **in_mu.duals}
-        if form.gauge == "norm" and GAUGE in in_b.duals:
-            duals[GAUGE] = in_b.duals[GAUGE] / 2.0  # the gradient of bᵀb is twice that of the tangent
-        last = Answer(Status.LIMIT, "iteration limit", dict(point), duals, count)
+        last = Answer(Status.LIMIT, "iteration limit", dict(point), {**in_b.duals, **in_mu.duals}, count)
         # the decrease has to be far below the requested accuracy, because convergence is only linear
         if before - in_mu.objective <= 1e-4 * settings.accuracy * max(in_mu.objective, 1e-9 * in_mu.scale):
             return replace(last, status=Status.LOCAL, word="stationary")
@@ -64,20 +55,6 @@ def run(problem: Problem, settings: Settings) -> Answer:
             for name in bs:
                 point[name] = point[name] / np.linalg.norm(point[name])
     return last or Answer(Status.LIMIT, "iteration limit", iterations=count)
-
-
-def _half_in_b(problem: Problem, point: Values, mus: list[str]) -> Problem:
-    """Return the half-step with every mu held; a gauge that is not convex is replaced by its tangent."""
-    def gauge(view: Any) -> dict[str, Any]:
-        return {GAUGE: [_tangent(one, view.inner, point) for one in problem.gauged]}
-
-    return problem.holding(point, mus, gauge)
-
-
-def _tangent(product: Product, v: Any, point: Values) -> Any:
-    if product.gauge != "norm":
-        return product.condition(v)
-    return flat(point[product.b]) @ cp.vec(v[product.b], order="F") == 1
 
 
 def _stopped(half: Solution, last: Answer | None, count: int) -> Answer:

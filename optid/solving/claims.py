@@ -12,10 +12,10 @@ from optid.certificate.convex import TANGENT
 from optid.certificate.infeasibility import satisfiable
 from optid.core.judge import judge
 from optid.core.least_squares import RankOneForm
+from optid.core.leaves import GAUGE
 from optid.core.problem import Problem
 from optid.core.statement import class_of, complete_values, statement_of
 from optid.core.terms import Squares, Values
-from optid.program.sizes import GAUGE
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, relative_gap, tolerance
 from optid.solving.answers import answer_of
 from optid.solving.proofs import proof_of

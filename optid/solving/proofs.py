@@ -3,9 +3,8 @@
 import numpy as np
 
 from optid.certificate.convex import certify_convex
-from optid.certificate.group_sparse import certify_groups
+from optid.certificate.dual_points import certify_groups, certify_low_rank
 from optid.certificate.lifting import certify_nuclear, certify_rank_one
-from optid.certificate.low_rank import certify_low_rank
 from optid.core.group_sparse import GroupSparseForm
 from optid.core.least_squares import RankOneForm
 from optid.core.low_rank import LowRankForm
@@ -28,10 +27,10 @@ def proof_of(problem: Problem, values: Values, duals: Values) -> tuple[Bound | N
         return problem.proof(problem, x, duals)
     if RankOneForm.of(problem) is not None:
         return certify_rank_one(problem, x)
-    if GroupSparseForm.of(problem) is not None:
-        return certify_groups(problem, x, duals), None
-    if LowRankForm.of(problem) is not None:
-        return certify_low_rank(problem, x, duals), None
+    if (groups := GroupSparseForm.of(problem)) is not None:
+        return certify_groups(problem, groups, x, duals), None
+    if (matrix := LowRankForm.of(problem)) is not None:
+        return certify_low_rank(problem, matrix, x, duals), None
     match problem.terms:
         case (Squares(lifted=RankOne(), z=z), NuclearNorms()) if z == tuple(problem.start):
             return certify_nuclear(problem, x, duals), None

@@ -181,42 +181,37 @@ def run(problem: Problem | Procedure, solver: Any = "auto", *, options: Mapping[
     constrained: dict[str, tuple[Problem, Solution]] = {}
     steps: list[tuple[str, Solution]] = []
     solvers, last = solver if isinstance(solver, Solvers) else Solvers(solver), {}
-
-    def solve_step(program: Problem) -> Solution:
+    procedure, solution, building = _alone(problem) if isinstance(problem, Problem) else problem, None, 0.0
+    while True:
+        clock = time.perf_counter()
+        try:
+            program = for_solvers(procedure.send(solution))  # pyright: ignore[reportArgumentType]
+        except StopIteration as stop:
+            found = stop.value
+            building += time.perf_counter() - clock
+            break
+        building += time.perf_counter() - clock
         asked = solvers.of(program)
         stands_in = asked == "auto" and (solvers.word != "auto" or solvers.named)
         solution = solve(program, asked, **settings, **({} if stands_in else options or {}))
         steps.append((program.name, solution))
         constrained.update(dict.fromkeys(program.constraint_names, (program, solution)))
-        last[program.name] = program, solution
-        return solution
+        last[program.name] = last[""] = program, solution
+    evidence = found if isinstance(found, Evidence) else None
+    program, solution = last[evidence.main if evidence else ""]
+    solution = replace(solution, times=replace(solution.times, build=building))
+    if evidence is None:
+        return Outcome(found, solution, program, tuple(steps), _substitutions(steps), constrained)
+    bound = None if callable(evidence.bound) else evidence.bound
+    solution = replace(solution, objective=evidence.objective, bound=bound, status=evidence.status,
+                       reason=evidence.reason)
+    if evidence.values is not None:
+        solution = replace(solution, values=complete_values(program, evidence.values))
+    figures = {**evidence.figures, **_substitutions(steps)}
+    return Outcome(evidence.model, solution, program, tuple(steps), figures, constrained, evidence)
 
-    if isinstance(problem, Problem):
-        program = for_solvers(problem)
-        solution = solve_step(program)
-        model = program.model(solution.values) if solution.has_point else None
-        return Outcome(model, solution, program, tuple(steps), constrained=constrained)
-    clock = time.perf_counter()
-    program = for_solvers(next(problem))
-    building = time.perf_counter() - clock
-    while True:
-        solution = solve_step(program)
-        clock = time.perf_counter()
-        try:
-            program = for_solvers(problem.send(solution))
-            building += time.perf_counter() - clock
-        except StopIteration as stop:
-            found = stop.value
-            building += time.perf_counter() - clock
-            if isinstance(found, Evidence) and found.main:
-                program, solution = last[found.main]
-            solution = replace(solution, times=replace(solution.times, build=building))
-            if not isinstance(found, Evidence):
-                return Outcome(found, solution, program, tuple(steps), _substitutions(steps), constrained)
-            bound = None if callable(found.bound) else found.bound
-            solution = replace(solution, objective=found.objective, bound=bound, status=found.status,
-                               reason=found.reason)
-            if found.values is not None:
-                solution = replace(solution, values=complete_values(program, found.values))
-            figures = {**found.figures, **_substitutions(steps)}
-            return Outcome(found.model, solution, program, tuple(steps), figures, constrained, found)
+
+def _alone(problem: Problem) -> Procedure:
+    """Solve one programme for the model of its solution."""
+    solution = yield problem
+    return problem.model(solution.values) if solution.has_point else None

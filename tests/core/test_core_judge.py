@@ -8,17 +8,13 @@ import pytest
 from test_core import exact_problem, record
 
 import optid
-from formulations.arx import _problem as arx_problem
 from optid.core.judge import judge, largest_excess
 from optid.core.leaves import LeafSpace, Quantity
-from optid.core.prices import price_constraints
 from optid.core.problem import Problem
 from optid.core.statement import for_solvers, is_stated, statement_of
 from optid.core.terms import GroupNorms, NuclearNorms, Squares
-from optid.errors import DataWarning, StructureError
-from optid.identify.equation_error import EquationStructure, compress
+from optid.errors import DataWarning
 from optid.program.solution import relative_gap
-from optid.registry import named_constraint
 from optid.solving.solve import solve
 
 pytestmark = pytest.mark.numerical
@@ -52,17 +48,6 @@ def test_a_solution_is_stationary_and_its_multipliers_are_those_of_the_programme
             np.testing.assert_allclose(ours, theirs, atol=2e-3 * np.max(np.abs(theirs)) + 1e-6 * found.objective)
 
 
-def test_degenerate_multipliers_are_priced_by_the_least():
-    def twice(v):
-        return {"one": v["a"][0] <= -1.0, "same": 2 * v["a"][0] <= -2.0, "idle": v["a"][1] >= -50}
-
-    problem = arx_problem(compress(RECORD, EquationStructure(2, 2, 1, "linear")), (twice,))
-    x, solution = solved(problem)
-    judged = judge(problem, x, solution.duals)
-    prices = {p.name: p.multiplier for p in price_constraints(problem, x, judged.duals, judged.objective)}
-    assert prices["one"] == pytest.approx(0, abs=1e-6 * solution.objective) == prices["same"] == prices["idle"]
-
-
 @pytest.mark.parametrize("words", WORDS[1:5])
 def test_other_points_do_not_stand_whatever_is_claimed_of_them(words):
     problem = exact_problem(1, words)
@@ -90,19 +75,6 @@ def test_a_constraint_on_one_factor_has_a_multiplier_of_the_gauge_beside_it():
     found = judge(problem, x, {})
     assert found.residuals.stationarity <= 1e-6 and found.duals["first"][0] > 0
     assert float(np.ravel(x["b"])[0]) == pytest.approx(0.995, abs=1e-8)
-
-
-def test_multipliers_are_the_rates_of_the_optimum():
-    def optimum(high):
-        problem = arx_problem(compress(RECORD, EquationStructure(2, 2, 1, "linear")),
-                              (lambda v: {"high": v["a"][0] <= high},))
-        x, solution = solved(problem)
-        return solution.objective, judge(problem, x, {}), problem
-
-    _, found, problem = optimum(-1.0)
-    rate = (optimum(-1.001)[0] - optimum(-0.999)[0]) / 0.002  # the objective falls where the bound rises
-    (one,) = problem.constraints()
-    assert problem.unit * found.duals["high"][0] / one.sizes[0] == pytest.approx(rate, rel=1e-3)
 
 
 def test_a_matrix_constraint_is_judged_by_its_null_directions():
@@ -144,19 +116,16 @@ def test_kinks_are_judged_by_the_nearest_subgradient(kind):
     assert judge(problem, {"Q": 1.01 * q}, {}).residuals.stationarity > 5e-4
 
 
-def test_the_words_of_the_tests_are_words():
-    assert all(named_constraint(word) for words in WORDS for word in words)
-
-
-@pytest.mark.parametrize("words, fixed", [(("monotone:increasing",), True), (("odd",), False), (("gain:1",), False),
-                                          (("coefficients:a,-1.5,1",), False), (("sign:b,negative",), True)])
-def test_signs_that_constraints_fix(words, fixed):
-    problem = exact_problem(0, words)
-    assert problem.fixes_signs == fixed
+@pytest.mark.parametrize("word, fixed", [
+    *((word, True) for word in ("monotone:increasing", "convex", "sign:b,negative")),
+    *((word, False) for word in ("odd", "stable", "gain:1", "coefficients:a,-1.5,1", "dead_zone:3,5", "range:-5,5"))])
+def test_constraints_fix_the_signs_of_f_and_b_only_where_they_tell_them_apart(word, fixed):
+    problem = exact_problem(0, (word,))
+    assert problem.fixes_signs is fixed
     turned = {**problem.start, "mu": -problem.start["mu"], "b": -problem.start["b"]}
     start = problem.signed_start()
     assert problem.violation(start) == min(problem.violation(problem.start), problem.violation(turned))
-    if words == ("sign:b,negative",):
+    if word == "sign:b,negative":
         assert np.all(start["b"] <= 0)
 
 
@@ -166,11 +135,6 @@ def test_a_constrained_fit_states_nothing_in_cvxpy_until_it_is_needed():
     assert set(fit.problem.constraint_names) == {"monotone:increasing", "gain"}
     assert fit.values["Theta"].shape == (6, 2) and not is_stated(fit.problem)
     assert statement_of(fit.problem).problem.is_dcp() is False and is_stated(fit.problem)
-
-
-def test_what_is_wrong_with_a_constraint_is_said_when_it_is_posed():
-    with pytest.raises(StructureError, match="asks for 'q'"):
-        optid.fit(RECORD, na=2, nb=2, basis="triangular:6", constraints=[lambda v: v["q"] <= 1])
 
 
 def test_what_is_no_number_is_a_violation_whatever_comes_after_it():

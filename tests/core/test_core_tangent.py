@@ -124,24 +124,37 @@ def test_rows_are_read_once_and_what_looks_at_the_iterate_at_every_one():
     assert calls["still"] == 1 and calls["moving"] == 4
 
 
+def gain(view):
+    return {"gain": cp.sum(view["Theta"]) == 1.0 + cp.sum(view["a"])}
+
+
+def definite(view):
+    a = view["a"]
+    return {"definite": cp.bmat([[1.0, a[0] / 2 + 0.3, 0.1], [a[0] / 2 + 0.3, 0.5, a[1]], [0.1, a[1], 0.4]]) >> 0}
+
+
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("damping", [0.0, 0.3])
-def test_a_step_in_rows_is_that_of_the_programme_in_cvxpy(seed, damping):
-    fit, z0 = fit_of(seed, lambda v: {"large": v["Theta"] <= 0.4},
-                     lambda v: {"gain": cp.sum(v["Theta"]) == 1.0 + cp.sum(v["a"])})
-    at = criterion_of(fit).linearise(z0)
-    program = step_problem(fit, z0, at, damping)
-    assert not is_stated(program) and class_of(program) == "QP"
+@pytest.mark.parametrize("rule, kind, damping, near", [
+    (gain, "QP", 0.0, 1e-4), (gain, "QP", 0.3, 1e-4), (definite, "SDP", 0.0, 1e-3)])
+def test_a_step_in_rows_is_that_of_the_programme_in_cvxpy(seed, rule, kind, damping, near):
+    fit, z0 = fit_of(seed, rule, lambda v: {"large": v["Theta"] <= 0.4})
+    at, names = criterion_of(fit).linearise(z0), criterion_of(fit).variables.names
+    program, stated = (step_problem(fit, z0, at, damping) for _ in range(2))
+    assert class_of(program) == kind == class_of(stated)
     rows = solve_with("clarabel", program, Settings(1e-10))
-    assert not is_stated(program)
-    stated = step_problem(fit, z0, at, damping)
     whole = solve_with("clarabel", stated, Settings(1e-10, options={"max_iter": 400}))
-    assert is_stated(stated) and rows.status == whole.status
-    for name in criterion_of(fit).variables.names:
-        np.testing.assert_allclose(rows.values[name], whole.values[name], rtol=1e-4, atol=1e-5)
-    for name in ("large", "gain"):
-        np.testing.assert_allclose(rows.duals[name], whole.duals[name], rtol=1e-3,
-                                   atol=1e-4 * np.abs(whole.duals[name]).max())
+    assert not is_stated(program) and is_stated(stated) and class_of(stated) == kind
+    assert rows.status == whole.status == Status.OPTIMAL
+    for name in names:
+        np.testing.assert_allclose(rows.values[name], whole.values[name], rtol=near, atol=near / 10)
+    for name in ("large", rule.__name__):
+        np.testing.assert_allclose(rows.duals[name], whole.duals[name], rtol=10 * near,
+                                   atol=near * np.abs(whole.duals[name]).max())
+    if kind == "SDP":
+        dual, matrix = rows.duals["definite"].reshape(3, 3), statement_of(stated).constraints["definite"][0].args[0]
+        statement_of(stated).assign({name: rows.values[name] for name in names})
+        assert np.linalg.eigvalsh(dual)[0] > -1e-6 * np.abs(dual).max()
+        assert abs(np.sum(dual * matrix.value)) < 1e-5 * np.abs(dual).max()
 
 
 def test_a_constraint_that_is_not_convex_is_refused():
@@ -166,28 +179,3 @@ def test_a_quantity_of_the_unknowns_is_a_leaf_like_any_other():
     found = solve_with("clarabel", for_solvers(step), Settings(1e-10)).values
     change = float(2 * x["mu"] @ (found["mu"] - x["mu"]) + x["mu"] @ x["mu"])
     assert change <= 0.5 + 1e-7
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_step_under_a_matrix_is_that_of_the_programme_in_cvxpy(seed):
-    def definite(view):
-        a = view["a"]
-        return {"definite": cp.bmat([[1.0, a[0] / 2 + 0.3, 0.1], [a[0] / 2 + 0.3, 0.5, a[1]], [0.1, a[1], 0.4]]) >> 0}
-
-    fit, z0 = fit_of(seed, definite, lambda v: {"large": v["Theta"] <= 0.4})
-    at = criterion_of(fit).linearise(z0)
-    program, stated = step_problem(fit, z0, at, 0.0), step_problem(fit, z0, at, 0.0)
-    assert class_of(program) == "SDP" == class_of(stated)
-    rows = solve_with("clarabel", program, Settings(1e-10))
-    assert not is_stated(program) and rows.status == Status.OPTIMAL
-    whole = solve_with("clarabel", stated, Settings(1e-10, options={"max_iter": 400}))
-    assert is_stated(stated) and class_of(stated) == "SDP"
-    for name in criterion_of(fit).variables.names:
-        np.testing.assert_allclose(rows.values[name], whole.values[name], rtol=1e-3, atol=1e-4)
-    for name in ("large", "definite"):
-        np.testing.assert_allclose(rows.duals[name], whole.duals[name], rtol=1e-2,
-                                   atol=1e-3 * np.abs(whole.duals[name]).max())
-    dual, matrix = rows.duals["definite"].reshape(3, 3), statement_of(stated).constraints["definite"][0].args[0]
-    statement_of(stated).assign({name: rows.values[name] for name in criterion_of(fit).variables.names})
-    assert np.linalg.eigvalsh(dual)[0] > -1e-6 * np.abs(dual).max()
-    assert abs(np.sum(dual * matrix.value)) < 1e-5 * np.abs(dual).max()

@@ -57,8 +57,6 @@ def test_what_is_neither_convex_nor_smooth_is_named():
     assert statement_of(program).nonconvex_parts() == ["the objective", "constraint 'gap'"]
 
 
-# subject_to
-
 def test_constraints_of_every_form_get_names():
     x = cp.Variable(2, name="x")
     group = name_limits({"one": x <= 1, "two": [x >= 0, x[0] == 0.5]}, "default")
@@ -76,37 +74,11 @@ def test_constraint_in_a_callable_sees_the_named_variables():
     assert found.duals["first"] == pytest.approx([0.25], abs=1e-5)
 
 
-def test_unknown_variable_names_the_nearest():
-    problem, _ = bilinear(lambda v: v["mi"] >= 0)
-    refuses(StructureError, "'mi'.*'mu'", problem.constraints)
-
-
-def test_foreign_variable_is_named():
-    problem, _ = bilinear({"odd": cp.Variable(name="stranger") >= 0})
-    refuses(StructureError, "stranger", problem.constraints)
-
-
-def test_names_are_used_once():
-    problem, _ = bilinear(lambda v: {"sign": v["b"][0] >= 0}, lambda v: {"sign": v["mu"] >= 0})
-    refuses(StructureError, "two constraints named 'sign'", problem.constraints)
-    refuses(StructureError, "two constraints named 'gauge'", for_solvers,
-            bilinear(lambda v: {"gauge": v["b"][0] >= 0})[0])
-
-
-def test_nonconvex_constraint_in_a_convex_formulation_is_refused():
-    ring = case("qp_equality").build().subject_to(lambda v: {"ring": cp.sum_squares(v["x"]) >= 1})
-    refuses(StructureError, "'ring' is not convex", ring.constraints)
-    nonconvex, _ = bilinear(lambda v: {"ring": cp.sum_squares(v["mu"]) >= 1})
-    assert "ring" in nonconvex.constraint_names
-
-
 def test_a_problem_itself_never_changes():
     problem, _ = bilinear()
     extended = problem.subject_to(lambda v: {"sign": v["mu"] >= 0})
     assert not problem.constraint_names and extended.constraint_names == ("sign",)
 
-
-# one factor held
 
 def test_a_bilinear_problem_with_one_factor_held_is_least_squares():
     problem, target = bilinear()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from problems import BASIS, dense, plant, raw_problem, record, regression
 from refusals import refuses
-from systems import BASES, by_hand, inputs, mimo, nonlinearity, siso
+from systems import BASES, by_hand, distance, inputs, mimo, nonlinearity, siso
 
 import optid
 from formulations.constraints import shape
@@ -20,12 +20,6 @@ FORMS = ["hammerstein_arx.exact", "hammerstein_arx.nuclear", "hammerstein_arx.ov
 def noise_free(model, count=300, seed=1):
     u = inputs(model, count, seed)
     return optid.Data(u=u, y=by_hand(model, u), dt=model.dt)
-
-
-def distance(found, true):
-    parts = [found.a - true.a, found.offset - true.offset]
-    parts += [found.theta(c) - true.theta(c) for c in range(true.m)]
-    return max(float(np.max(np.abs(part), initial=0.0)) for part in parts)
 
 
 @pytest.mark.parametrize("form", FORMS)

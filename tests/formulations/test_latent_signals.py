@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scripts
+from refusals import refuses
 from scipy.signal import lfilter
 from state_systems import by_hand
 
@@ -170,10 +171,8 @@ def test_a_state_far_from_rest_is_found(seed):
 
 
 def test_shapes_are_refused_by_name():
-    with pytest.raises(StructureError, match=r"Cz has shape \(2, 2\).*2 of latent signals"):
-        latent(Cz=np.zeros((2, 2)))
-    with pytest.raises(StructureError, match="no part that is not affine"):
-        beyond_affine(Polynomial(1, interval=(-1.0, 1.0)))
+    refuses(StructureError, r"Cz has shape \(2, 2\).*2 of latent signals", latent, Cz=np.zeros((2, 2)))
+    refuses(StructureError, "no part that is not affine", beyond_affine, Polynomial(1, interval=(-1.0, 1.0)))
 
 
 @pytest.mark.parametrize("basis", [Polynomial(2), Polynomial(5), BSpline(6), BSpline(6, outside="linear")])
@@ -343,8 +342,7 @@ def test_a_fit_goes_on_from_a_model_with_latent_signals():
     assert again.solution.objective == pytest.approx(cold.solution.objective, rel=1e-4)
     with pytest.raises(StructureError, match="other basis functions|latent"):
         optid.fit(moved, "lfr.exact", nx=2, latent="states", latent_basis="bspline:4", initial=before, tries=0)
-    with pytest.raises(OptidError, match="no start has a finite run"):
-        optid.fit(moved, "lfr.exact", nx=2, latent="states", tries=0)
+    refuses(OptidError, "no start has a finite run", optid.fit, moved, "lfr.exact", nx=2, latent="states", tries=0)
 
 
 @pytest.mark.parametrize("formulation, front", [("wiener_ss.exact", False), ("hammerstein_wiener_ss.exact", True)])
@@ -494,5 +492,4 @@ def test_functions_of_latent_signals_are_bent_as_asked_or_the_question_is_refuse
                         (shape.even("z1"), "slope of the function"), (shape.gain(1.0, channel="z1"), "no static"),
                         (shape.convex("z2"), "a latent signal is z1"),
                         (shape.monotone("decreasing", "z1"), "sign of z1 is arbitrary")):
-        with pytest.raises(StructureError, match=words):
-            fit(rule)
+        refuses(StructureError, words, fit, rule)

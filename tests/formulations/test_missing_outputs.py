@@ -71,9 +71,6 @@ def test_two_fifths_missing_in_experiments(formulation, experiments):
     assert np.min(fit_percent(clean.y, found.simulate(clean, x0="fit"))) > 98
 
 
-# -- what is done, and what is said of it ------------------------------------------------------------------------------
-
-
 def punctured(outputs=2, share=0.2, samples=3000):
     return gaps.punctured(gaps.record(CELLS[f"hammerstein_ss.sid {outputs}y"], samples, 0), share, 0)
 

@@ -174,15 +174,6 @@ def test_stability_of_a_constrained_armax_plant():
     assert fit.solution.status is Status.LOCAL and fit.prices[0].active
 
 
-@pytest.mark.parametrize("solver", ["clarabel", "osqp", "piqp"])
-def test_back_ends_agree(solver):
-    if solver not in [name for name, end in optid.backends.back_ends().items() if end.installed]:
-        pytest.skip(f"{solver} is not installed")
-    data, orders = record(system("armax"), (300,)), ORDERS["armax"][1]
-    reference = optid.fit(data, armax, **orders).solution.objective
-    assert quiet(data, armax, solver=solver, **orders).solution.objective == pytest.approx(reference, rel=1e-6)
-
-
 @pytest.mark.parametrize("gauge", ["norm", "gain", "b0"])
 def test_gauges_describe_the_same_model(gauge):
     data, orders = record(system("bj"), (300,)), ORDERS["bj"][1]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refuses
 
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
@@ -183,8 +184,7 @@ def test_what_the_record_does_not_determine_is_named():
     form = ObserverForm(A, C, np.zeros((2, 2)), expansion, 1, (True, True), True, np.ones(2))
     with pytest.raises(RankError, match="function 1 of pump"):
         observer_problem(records, form, None).least_squares()
-    with pytest.raises(RankError, match="equations for"):
-        observer_problem([records[0][:6]], form, None)
+    refuses(RankError, "equations for", observer_problem, [records[0][:6]], form, None)
 
 
 def test_feedback_functions_are_orthonormal_on_the_record_and_lose_what_is_linear():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refuses
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
@@ -114,8 +115,7 @@ def test_intervals_are_those_of_the_posterior():
 
 
 def test_words_are_refused():
-    with pytest.raises(StructureError, match="prior='rbf': use one of none, tc, dc, ss"):
-        optid.fit(record(), "fir", nb=10, prior="rbf")
+    refuses(StructureError, "prior='rbf': use one of none, tc, dc, ss", optid.fit, record(), "fir", nb=10, prior="rbf")
     with pytest.raises(StructureError, match="loss 'huber': a prior takes its strength"):
         optid.fit(record(), "arx", na=2, nb=2, loss="huber", prior="tc")
 

@@ -3,7 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
-from problems import BASIS, NODES, dense, plant, raw_problem, record, search
+from problems import BASIS, NODES, dense, raw_problem, record, search
 from refusals import refuses
 from systems import nonlinearity
 
@@ -127,8 +127,9 @@ def test_slack_constraints_change_nothing():
     data = record()
     free = optid.fit(data, na=2, nb=2, basis=BASIS)
     fit = optid.fit(data, na=2, nb=2, basis=BASIS, constraints=[
-        shape.slope(-50, 50), shape.value_range(-50, 50), shape.gain(low=-50, at=0.1), shape.coefficients("a", high=9)])
-    assert fit.solution.objective == pytest.approx(free.solution.objective, rel=1e-9)
+        shape.slope(-50, 50), shape.value_range(-50, 50), shape.gain(low=-50, at=0.1), shape.coefficients("a", high=9),
+        "stable:0.99"])
+    assert fit.solution.objective == pytest.approx(free.solution.objective, rel=1e-10)
     assert all(not price.binding and abs(price.multiplier) < 1e-6 for price in fit.prices)
     assert fit.solution.proof
 
@@ -210,13 +211,6 @@ def test_a_direction_of_b_decides_the_sign_of_a_monotone_f(gain):
     assert worse.solution.objective > 2 * fit.solution.objective
 
 
-def test_the_sign_rule_of_the_gauge_rests_where_a_constraint_fixes_a_sign():
-    fit = optid.fit(record(-1.0, noise=0.2), na=2, nb=2, basis=BASIS,
-                    constraints=[lambda v: {"rising": BASIS.increments() @ v["mu"] >= 0}, shape.sign("b", "negative")])
-    assert np.all(fit.model.b[0] < 0)
-    assert shaped(fit.model, GRID)[-1] > shaped(fit.model, GRID)[0]
-
-
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize("form", ["hammerstein_arx.exact", "hammerstein_arx.overparametrised", "hammerstein_oe.exact",
                                   "hammerstein_armax.exact", "hammerstein_ss.sid", "hammerstein_ss.exact"])
@@ -275,7 +269,7 @@ def test_two_channels_share_their_dynamics():
     (lambda: shape.gain(float("inf")), "finite numbers; got inf"),
     (lambda: shape.slope(low=float("nan")), "finite numbers; got nan"),
     (lambda: shape.dead_zone(1, 1), "low < high"),
-    (lambda: shape.saturation(), "needs a level"),
+    (lambda: shape.saturation(), "low= and/or high="),
     (lambda: shape.through([0, 1], [1]), "as many outputs as inputs"),
     (lambda: shape.coefficients("a"), "low= and/or high="),
 ])
@@ -290,8 +284,6 @@ def test_impossible_arguments_are_refused_at_once(build, words):
     (shape.fixed("mu", [1.0, 2.0]), r"'mu' has shape \(6,\)"),
     (shape.coefficients("b", high=1.0), "'norm' only fixes a length"),
     (lambda v: {"q": v["c"] >= 0}, "asks for 'c'"),
-    (lambda v: {"q": True}, "'q' is a bool, not a CVXPY constraint"),
-    (lambda v: {"q": cp.Variable(name="mine") >= 0}, "uses mine, which is not a variable"),
 ])
 def test_constraints_that_do_not_fit_the_structure_are_refused(rule, words):
     refuses(StructureError, words, optid.fit, record(), na=2, nb=2, basis=BASIS, constraints=[rule])
@@ -313,13 +305,6 @@ def test_symmetry_needs_zero_inside_the_interval():
     moved = optid.Data(u=data.u + 3, y=data.y)
     with pytest.raises(StructureError, match="does not contain zero"):
         optid.fit(moved, na=2, nb=2, basis="triangular:6", constraints=[shape.odd()])
-
-
-def test_static_characteristics_do_not_vanish_into_an_integrator():
-    """With 1 + sum(a) = 0 every static bound would hold of nothing at all."""
-    assert plant().a.sum() > -1
-    with pytest.raises(optid.errors.InfeasibleError, match="'slope' and 'gain' contradict"):
-        optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=[shape.slope(low=2, high=3), shape.gain(1.0, at=0.1)])
 
 
 def test_two_of_a_kind_get_names_of_their_own():

@@ -3,11 +3,11 @@
 
 import numpy as np
 import pytest
+from refusals import refuses
 from sample_fits import quiet
 
 import optid
 from formulations.constraints import shape
-from formulations.constraints.poles import stable
 from optid.bases import UserFunctions
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
@@ -68,9 +68,6 @@ def without_injection(model):
     return model.inject_output(-model.L)
 
 
-# -- exact recovery ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("arguments", [{}, {"noise": "white"}, {"iterations": 0, "noise": "white"}, {"iterations": 1},
                                        {"form": "correlation"}, {"weighting": "cva"}, {"split": "lumped"}])
 def test_asivid_recovers_a_noise_free_system(arguments):
@@ -127,9 +124,6 @@ def test_sid_recovers_a_linear_system_of_unknown_order():
 def test_sivid_recovers_with_future_inputs():
     fit = optid.fit(example1(1500), "hammerstein_ss.sivid", **KNOWN, instruments="inputs+past", tolerance=1e-8)
     assert gap(without_injection(fit.model).A, A) < 1e-9
-
-
-# -- noise ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -199,9 +193,6 @@ def test_innovation_form_predicts_better_than_the_simulation():
     assert fit.one_step_fit[0] > fit.simulation_fit[0] + 3
 
 
-# -- constraints ------------------------------------------------------------------------------------------------------
-
-
 def test_gain_and_idle_input_are_obeyed():
     from formulations.constraints.responses import no_effect
 
@@ -228,22 +219,10 @@ def test_gain_of_a_hammerstein_channel_and_monotone():
     assert np.all(np.diff(f) > -1e-9) or np.all(np.diff(f) < 1e-9)
 
 
-def test_poles_obey_a_stability_margin():
-    data = example1(800, 0.0, 0.3, closed=False)
-    free = optid.fit(data, "hammerstein_ss.sid", nx=3).model
-    fit = optid.fit(data, "hammerstein_ss.sid", nx=3, constraints=[stable(0.6)])
-    assert np.abs(free.poles).max() > 0.7 and np.abs(fit.model.poles).max() <= 0.6 + 1e-5
-    assert fit.figures["suboptimality of A under the pole constraints"] > 0
-    assert any("shift" in name for name, _ in fit.steps)
-
-
 def test_known_feedthrough():
     data = example1(1500, closed=False)
     model = optid.fit(data, "hammerstein_ss.sid", nx=3, basis=F, feedthrough=[True, False]).model
     assert not model.D[:, 1].any() and np.abs(model.D[:, 0]).max() < 1e-6
-
-
-# -- bad input --------------------------------------------------------------------------------------------------------
 
 
 def broken(change):
@@ -272,8 +251,7 @@ def broken(change):
     (example1(600), {"nx": 3, "feedthrough": [True]}, StructureError, "feedthrough=")])
 def test_refusals(data, arguments, error, text):
     arguments = {"basis": F} | arguments
-    with pytest.raises(error, match=text):
-        quiet(data, "hammerstein_ss.asivid", **arguments)
+    refuses(error, text, quiet, data, "hammerstein_ss.asivid", **arguments)
 
 
 def test_nearly_linear_feedback_is_refused_or_warned_of():

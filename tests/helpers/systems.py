@@ -45,6 +45,12 @@ def inputs(model, count=200, seed=1):
     return np.random.default_rng(seed).uniform(-0.7, 1.3, (count, model.m))
 
 
+def distance(found, true):
+    """Largest difference of the coefficients of two transfer functions."""
+    parts = [found.a - true.a, found.offset - true.offset, *(found.theta(c) - true.theta(c) for c in range(true.m))]
+    return max(float(np.max(np.abs(part), initial=0.0)) for part in parts)
+
+
 def by_hand(model, u, y_past=None, w_past=None, noise=None):
     """Run the difference equation sample by sample with zeros, or the given past, before the record."""
     count, n = len(u), 10

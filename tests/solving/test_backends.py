@@ -117,8 +117,6 @@ def test_multipliers_are_the_prices_of_the_right_hand_side(name):
     assert base.duals["floor"] == pytest.approx(0.0, abs=1e-6)
 
 
-# the translator
-
 def translated(expression: cp.Expression):
     """Value of an expression by CasADi at the values its variables hold."""
     import casadi as ca

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 
 from optid.backends.block_descent import minimise
 from optid.errors import StructureError
@@ -90,5 +91,4 @@ def test_bad_numbers():
         (np.diag([1.0, 2, 1, 1]), r, np.array([0, 2, 4]), np.ones(2), "one length"),
         (eye * np.nan, r, np.arange(5), np.ones(4), "not finite"),
     ):
-        with pytest.raises(StructureError, match=words):
-            GroupProblem(design, target, edges, weights)
+        refuses(StructureError, words, GroupProblem, design, target, edges, weights)

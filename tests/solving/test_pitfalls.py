@@ -28,8 +28,6 @@ def through_cvxpy(program: Problem, settings: Settings) -> Answer:
     return Answer(status, stated.problem.status, stated.values(), stated.duals())
 
 
-# 1
-
 def test_1_success_at_an_infeasible_stationary_point_is_not_believed():
     program = for_solvers(case("nlp_infeasible_stationary").build())
     believed = BackEnd("believed", frozenset({"NLP"}), through_cvxpy)
@@ -60,8 +58,6 @@ def test_1_our_nlp_back_ends_return_multipliers(name):
     assert found.residuals.stationarity < 1e-8 and found.residuals.complementarity < 1e-7
 
 
-# 2
-
 @pytest.mark.parametrize("name", ["uno", "ipopt", "fatrop"])
 def test_2_zero_is_a_saddle_and_the_start_belongs_to_the_programme(name):
     target = np.outer([1.0, 2.0], [2.0, 1.0])
@@ -79,8 +75,6 @@ def test_2_zero_is_a_saddle_and_the_start_belongs_to_the_programme(name):
     assert solve(program, name).objective == pytest.approx(0.0, abs=1e-8)
 
 
-# 3
-
 @pytest.mark.parametrize("name", ["uno", "ipopt", "fatrop"])
 def test_3_multipliers_come_back_by_inverse_data_not_by_position(name):
     # the epigraph rows of abs and max and the rows of the symmetric variable stand between the named ones
@@ -97,8 +91,6 @@ def test_3_multipliers_come_back_by_inverse_data_not_by_position(name):
     assert np.max(np.abs(known.duals["size"])) > 0.1 and abs(known.duals["link"][0]) > 0.1
     assert found.status is Status.LOCAL or found.proof
 
-
-# 4
 
 def jacobian_entries(program: Problem) -> int:
     import casadi as ca
@@ -119,8 +111,6 @@ def test_4_constant_data_keep_their_sparsity():
     assert jacobian_entries(rows(sp.csc_array(matrix), level)) == entries
 
 
-# 5
-
 def test_5_objectives_are_in_data_units_because_residuals_are_variables():
     rng = np.random.default_rng(1)
     a, y = rng.standard_normal((50, 4)), 1e5 + 1e-2 * rng.standard_normal(50)
@@ -139,8 +129,6 @@ def test_5_objectives_are_in_data_units_because_residuals_are_variables():
     assert abs(expanded - known) > 1e-5 * known or abs(float(square.value) - known) > 1e-3 * known  # the evidence
 
 
-# 6
-
 def test_6_highs_is_never_offered_through_casadi():
     offered = [back_end for point in entry_points(group="optid.backends") for back_end in point.load()()]
     assert {back_end.name for back_end in offered if back_end.pip == "casadi"} == {"ipopt", "fatrop"}
@@ -151,8 +139,6 @@ def test_6_highs_and_casadi_live_in_one_process():
     for name in ("highs", "ipopt", "highs", "fatrop"):
         assert solve(case("qp_box").build(), name).status is Status.OPTIMAL
 
-
-# 7
 
 @pytest.mark.parametrize("name", ["sleqp", "bonmin", "sqpmethod", "madnlp", "blocksqp", "feasiblesqpmethod"])
 def test_7_what_does_not_pass_the_suite_is_not_offered(name):
@@ -172,8 +158,6 @@ def test_7_sqpmethod_indeed_does_not_pass():
     found = solver(x0=form.start(), p=[], lbg=form.row_bounds[0], ubg=form.row_bounds[1])
     assert not solver.stats()["success"] or float(found["f"]) > 1.01 * case("rank_one_fit").value
 
-
-# 8
 
 def fit(gauge: str, **constraint) -> Problem:
     matrix, y = planted_fit()
@@ -199,8 +183,6 @@ def test_8_there_is_no_automatic_relaxation():
     assert not [name for name in dir(Problem) if "relax" in name or "convexify" in name]
     refuses(StructureError, "not convex", solve, fit("norm"), "clarabel")
 
-
-# 9
 
 def test_9_hessians_are_exact():
     import casadi as ca

@@ -88,12 +88,6 @@ def test_cones_on_the_exact_form_are_solved_without_a_proof(build):
     assert convex.solution.objective <= fit.solution.objective * (1 + 1e-9)
 
 
-def test_without_a_point_there_are_no_prices():
-    fit = optid.fit(record(), na=2, nb=2, basis=BASIS, raises=False,
-                    constraints=[lambda v: {"x": [v["a"][0] >= 1, v["a"][0] <= 0]}])
-    assert fit.prices == () and fit.model is None
-
-
 def test_equalities_are_active():
     fit = optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=[shape.fixed("a", [-1.1, 0.4])])
     assert (fit.prices[0].active, fit.prices[0].rows, fit.prices[0].slack) == (2, 2, 0.0)

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from refusals import refuses
 
 import optid
 from optid import Data
@@ -131,8 +132,7 @@ def test_native_options_are_those_of_the_named_solver():
     ("oe.exact", "clarabell", LookupFailed, "clarabel"),
 ])
 def test_refusals_before_the_record_is_looked_at(name, solver, error, words):
-    with pytest.raises(error, match=words):
-        fitted(name, solver, Data(np.zeros(3), np.zeros(3)))
+    refuses(error, words, fitted, name, solver, Data(np.zeros(3), np.zeros(3)))
 
 
 def test_a_solver_that_a_constraint_of_the_user_excludes_is_refused():
@@ -146,10 +146,8 @@ def test_formulations_without_declared_steps_are_refused_by_their_programmes():
     def bare(data, *, na=1, nb=1, nk=1):
         return formulation("arx")[1](data, na=na, nb=nb, nk=nk)
 
-    with pytest.raises(SolverRefused, match="gauss_newton"):
-        optid.fit(record(), bare, solver="gauss_newton")
-    with pytest.raises(SolverRefused, match="declares no steps"):
-        optid.fit(record(), bare, solver={"arx": "scs"})
+    refuses(SolverRefused, "gauss_newton", optid.fit, record(), bare, solver="gauss_newton")
+    refuses(SolverRefused, "declares no steps", optid.fit, record(), bare, solver={"arx": "scs"})
     marked = declare_steps(lambda given: {"arx": "QP linear"})(bare)
     assert optid.fit(record(), marked, solver={"arx": "scs"}).solution.solver == "scs"
 
@@ -165,8 +163,7 @@ def test_a_back_end_of_the_user_serves_a_step():
 def test_the_command_line_names_steps():
     assert solver_choice("scs") == "scs"
     assert solver_choice("shift with fixed P=scs, split=ipopt") == {"shift with fixed P": "scs", "split": "ipopt"}
-    with pytest.raises(StructureError, match="'shift' twice"):
-        solver_choice("shift=scs,shift=clarabel")
+    refuses(StructureError, "'shift' twice", solver_choice, "shift=scs,shift=clarabel")
 
 
 def test_studies_compare_solvers_of_the_main_step():
@@ -175,8 +172,7 @@ def test_studies_compare_solvers_of_the_main_step():
     class Cell:
         formulation_name, options, constraints, solver_name = "subspace.nuclear", {"nx": 1}, (), "osqp"
 
-    with pytest.raises(SolverRefused, match="'low rank', the main step"):
-        _check_main_step(Cell)
+    refuses(SolverRefused, "'low rank', the main step", _check_main_step, Cell)
     Cell.solver_name = "scs"
     _check_main_step(Cell)
     assert issubclass(SolverRefused, OptidError)

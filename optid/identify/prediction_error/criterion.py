@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.core.leaves import Product
 from optid.core.terms import Squares, Values, flat
 from optid.data.channels import Transform
 from optid.data.record import Data
@@ -100,6 +101,18 @@ class Criterion(ABC):
     def common(self) -> dict[str, Any]:
         """Return what every `optid.core.problem.Problem` of the errors has: scale, unit, and energy of the record."""
         return {"scale": self.energy, "unit": self.unit, "energy": self.unit * self.energy_of_record}
+
+    def factors(self, gauge: str = "") -> tuple[Product, ...]:
+        """Return ``Theta = mu bᵀ`` of every input whose function is unknown; where no gauge is named there is none."""
+        unknowns: Any = self.unknowns
+        return tuple(Product(self.key("mu", c), self.key("b", c), gauge)
+                     for c, free in enumerate(unknowns.free) if free)
+
+    def linear_thetas(self, variables: Mapping[str, Any]) -> dict[str, cp.Expression]:
+        """Return ``Theta``, one row, of every input that acts linearly."""
+        unknowns: Any = self.unknowns
+        return {self.key("Theta", c): cp.reshape(variables[self.key("b", c)], (1, -1), order="F")
+                for c, free in enumerate(unknowns.free) if not free}
 
     @property
     def errors(self) -> str:

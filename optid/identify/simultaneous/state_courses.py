@@ -20,6 +20,7 @@ from optid.arrays import Array
 from optid.bases.basis import Basis, span
 from optid.bases.expansions import Polynomial, Trigonometric
 from optid.core.judge import largest_excess
+from optid.core.leaves import GAUGE
 from optid.core.problem import Problem
 from optid.core.terms import Values
 from optid.data.record import Data
@@ -33,7 +34,6 @@ from optid.identify.prediction_error.tangent_descent import NO_BOUND
 from optid.identify.simultaneous.courses import Courses, Expressions, Formula, Pose, Reading, check_size
 from optid.identify.subspace.plan import Plan
 from optid.models.roots import spectral_radius
-from optid.program.sizes import GAUGE
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
 
@@ -87,9 +87,7 @@ class StateCourses(Courses):
 
     def further(self, v: Expressions, x: Values) -> dict[str, Any]:
         """Return Theta of every linear input."""
-        errors = self.criterion
-        return {errors.key("Theta", c): cp.reshape(v[errors.key("b", c)], (1, -1), order="C")
-                for c, free in enumerate(errors.unknowns.free) if not free}
+        return self.criterion.linear_thetas(v)
 
     def formulas(self, i: int) -> dict[str, Formula]:
         """Return what the latent signals and the outputs are equal to."""

@@ -17,14 +17,13 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.arrays import Array
-from optid.core.leaves import Product
+from optid.core.leaves import GAUGE
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import check_offset
 from optid.identify.prediction_error.search import arx_start, iterate_passes
 from optid.identify.prediction_error.transfer_errors import TransferErrors, TransferOrders, transfer_errors
 from optid.identify.simultaneous.courses import Courses, Expressions, Formula, Reading, check_size
-from optid.program.sizes import GAUGE
 
 REFLECTION = 1 - 1e-7  # largest modulus of a reflection coefficient
 LIMIT = 20_000  # samples up to which the programme is built: beyond, factorisations and CVXPY's own work take minutes
@@ -77,8 +76,7 @@ class TransferCourses(Courses):
     def confining(self, v: Expressions) -> dict[str, Any]:
         """Return the gauge, and the constraints that build A up from reflection coefficients."""
         errors = self.criterion
-        products = [Product(errors.key("mu", c), errors.key("b", c), errors.gauge) for c in range(errors.data.m)]
-        found = {GAUGE: [one.condition(v) for one in products]}
+        found = {GAUGE: [one.condition(v) for one in errors.factors(errors.gauge)]}
         if "kappa" not in v:
             return found
         kappa, below = v["kappa"], None
