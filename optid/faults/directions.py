@@ -22,11 +22,8 @@ from optid.faults.whitening import Predictor, predictor
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
-UNLIMITED = 1e5
-"""Standard deviation of a disturbance, relative to those of the innovations that it affects."""
-
-ROUND = 1e-6
-"""Isotropic covariance added to the process noise, relative to its trace."""
+UNLIMITED = 1e5  # standard deviation of a disturbance, relative to those of the innovations that it affects
+ROUND = 1e-6  # isotropic covariance added to the process noise, relative to its trace
 
 GENERIC = np.exp(0.7j) * 1.3
 """Point of the z plane at which the rank of the transfer matrix from disturbances to outputs is computed."""

@@ -19,14 +19,12 @@ from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Dictionary
 from optid.registry import Rendered
 
-GRID = np.concatenate([[0.0], np.geomspace(0.5, 600.0, 72)])
-"""Deflections at which the probabilities are computed."""
+GRID = np.concatenate([[0.0], np.geomspace(0.5, 600.0, 72)])  # deflections at which the probabilities are computed
 
 NUMBERS = 200_000_000
 """Numbers in the simulated windows of one fault above which a study is refused, because of the memory."""
 
-MIDDLE = 0.3, 0.7
-"""Range of a random onset, as shares of the window."""
+MIDDLE = 0.3, 0.7  # range of a random onset, as shares of the window
 
 
 class Forecast(NamedTuple):

@@ -53,41 +53,21 @@ if TYPE_CHECKING:
 
 MATRICES = ("A", "B", "C", "D", "E", "L", "K", "offset_x", "offset_y")
 
-STEP = 1e-5
-"""Step of the central differences, relative to the parameter and to the size of its matrix."""
-
-KNOWN = 1e-12
-"""Share of the largest information below which a direction changes no prediction."""
-
-CONFIDENCE = 0.95
-"""Of the upper bound of the factor of the covariance from a healthy record."""
-
-FACTORS = 1.0, 1000.0, 300
-"""The smallest factor, the largest, and their number."""
-
-SECTIONS = 10
-"""Sections of the record of identification between which the parameters may vary."""
-
-SMOOTHED = 5
-"""Samples over which the operating point is averaged."""
-
-REJECTED = 3.0
-"""Standard deviations of the score at which equal parameters of all sections are rejected."""
-
-LARGEST, OFTEN = 100, 10
-"""Largest number of coefficients of products, and fewest samples for each parameter with them."""
-
-ITERATIONS = 30
-"""Iterations of the estimate of their variation."""
+STEP = 1e-5  # step of the central differences, relative to the parameter and to the size of its matrix
+KNOWN = 1e-12  # share of the largest information below which a direction changes no prediction
+CONFIDENCE = 0.95  # of the upper bound of the factor of the covariance from a healthy record
+FACTORS = 1.0, 1000.0, 300  # the smallest factor, the largest, and their number
+SECTIONS = 10  # sections of the record of identification between which the parameters may vary
+SMOOTHED = 5  # samples over which the operating point is averaged
+REJECTED = 3.0  # standard deviations of the score at which equal parameters of all sections are rejected
+LARGEST, OFTEN = 100, 10  # largest number of coefficients of products, and fewest samples for each parameter with them
+ITERATIONS = 30  # iterations of the estimate of their variation
 
 BEYOND = 1.1
 """Distance of the readings from the middle of their range, in half ranges, from which the model extrapolates."""
 
-DRAWS = 4000
-"""Simulated energies behind the bound of the factor."""
-
-DIFFUSE = 1e6
-"""Standard deviation of an unknown initial state, relative to its effect."""
+DRAWS = 4000  # simulated energies behind the bound of the factor
+DIFFUSE = 1e6  # standard deviation of an unknown initial state, relative to its effect
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,19 +220,13 @@ def model_uncertainty(
 
 
 class Gathered(NamedTuple):
-    """What a record says about parameters.
+    """What a record says about parameters."""
 
-    Attributes:
-        information: (p, p).
-        readings: less those that initial states and decoupled disturbances take.
-        energy: of the whitened innovations.
-        sections: products (p, p) of the sensitivities, and (p,) with the innovations, of sections in the order of time
-            and in that of the operating point.
-    """
-
-    information: Array
-    readings: int
-    energy: float
+    information: Array  # (p, p)
+    readings: int  # less those that initial states and decoupled disturbances take
+    energy: float  # of the whitened innovations
+    # products (p, p) of the sensitivities, and (p,) with the innovations, of sections in the order of time and in that
+    # of the operating point
     sections: tuple[list[tuple[Array, Array]], list[tuple[Array, Array]]]
 
 

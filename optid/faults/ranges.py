@@ -18,41 +18,22 @@ from optid.models.model import impulse_response
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
-TOLERATED = 0.02
-"""Share of the range by which an input may leave it as long as no output shows it."""
-
-UNSEEN = 0.1
-"""Largest shift of an output by the unknown effect that is tolerated, in standard deviations of the noise."""
-
-REACH = 50
-"""Samples of the impulse response that are considered."""
-
-MOST = 400
-"""Largest number of samples outside."""
-
-FAR = 1.5
-"""Distance from the middle of the range, in half ranges, up to which a linear function is extrapolated."""
-
-STAY = 3
-"""Samples in a row outside, from which on a record is not used."""
+TOLERATED = 0.02  # share of the range by which an input may leave it as long as no output shows it
+UNSEEN = 0.1  # largest shift of an output by the unknown effect that is tolerated, in standard deviations of the noise
+REACH = 50  # samples of the impulse response that are considered
+MOST = 400  # largest number of samples outside
+FAR = 1.5  # distance from the middle of the range, in half ranges, up to which a linear function is extrapolated
+STAY = 3  # samples in a row outside, from which on a record is not used
 
 
 class Outside(NamedTuple):
-    """An input that leaves its range.
+    """An input that leaves its range."""
 
-    Attributes:
-        name: of the input.
-        column: function of the input.
-        interval: its range.
-        samples: where it is outside; for a linear function, where it is too far outside.
-        is_linear: whether the function is linear.
-    """
-
-    name: str
-    column: int
-    interval: tuple[float, float]
-    samples: np.ndarray
-    is_linear: bool
+    name: str  # of the input
+    column: int  # function of the input
+    interval: tuple[float, float]  # its range
+    samples: np.ndarray  # where it is outside; for a linear function, where it is too far outside
+    is_linear: bool  # whether the function is linear
 
     def __str__(self) -> str:
         """State the input, the range and the samples."""

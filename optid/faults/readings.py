@@ -8,14 +8,9 @@ import numpy as np
 
 from optid.arrays import Array
 
-DEAD = 10
-"""Consecutive missing readings of a sensor, while the inputs are present, after which it is dead."""
-
-FROZEN = 5
-"""Fewest consecutive identical readings of a frozen sensor."""
-
-CHANCE = 1e-10
-"""Largest probability of that many identical readings of a healthy sensor."""
+DEAD = 10  # consecutive missing readings of a sensor, while the inputs are present, after which it is dead
+FROZEN = 5  # fewest consecutive identical readings of a frozen sensor
+CHANCE = 1e-10  # largest probability of that many identical readings of a healthy sensor
 
 FLAT = 3
 """Identical readings of a frozen sensor that repeats no other reading in a record.
@@ -24,8 +19,7 @@ A sensor that repeats readings with the probability p shows this in N healthy on
 N p^2 exp(-N p), at most .5 / N.
 """
 
-USUAL = 2
-"""A gap of a record is dead if it is more than so many times as long as any other one of the sensor."""
+USUAL = 2  # a gap of a record is dead if it is more than so many times as long as any other one of the sensor
 
 
 class SensorFinding(NamedTuple):

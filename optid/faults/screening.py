@@ -20,11 +20,8 @@ if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
 UNITS = (1000.0, 100.0, 60.0, 25.4, 10.0, 9.81, 9 / 5, np.pi / 180)
-FACTORS = (*UNITS, *(1 / unit for unit in UNITS))
-"""Factors between units of the same quantity."""
-
-BETTER = 0.1
-"""Share of the energy of the innovations below which another order or unit of the channels is accepted."""
+FACTORS = (*UNITS, *(1 / unit for unit in UNITS))  # factors between units of the same quantity
+BETTER = 0.1  # share of the energy of the innovations below which another order or unit of the channels is accepted
 
 
 def flat_lines(data: Data) -> tuple[LostReadings, ...]:

@@ -24,20 +24,11 @@ if TYPE_CHECKING:
 STANDING, STATE_JUMP = "stuck", "jump"
 """The kind of an actuator to whose effect any constant is added, and that of the state by default."""
 
-SAME = 1e-3
-"""Sine of the angle between two signatures below which no record isolates them."""
-
-NEAR = 0.3
-"""Sine of the angle between two signatures below which only large faults are isolable."""
-
-UNSEEN = 1e-9
-"""Share of its largest possible size below which a signature is zero."""
-
-FORGOTTEN = 1e-4
-"""Share of its largest value below which a signature has decayed."""
-
-LONGEST = 4000
-"""Largest number of samples over which signatures are compared."""
+SAME = 1e-3  # sine of the angle between two signatures below which no record isolates them
+NEAR = 0.3  # sine of the angle between two signatures below which only large faults are isolable
+UNSEEN = 1e-9  # share of its largest possible size below which a signature is zero
+FORGOTTEN = 1e-4  # share of its largest value below which a signature has decayed
+LONGEST = 4000  # largest number of samples over which signatures are compared
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,20 +19,14 @@ from optid.phrases import p_value
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
-LAGS = 20
-"""Lags of the whiteness test."""
-
-NOT_WHITE = 1e-3
-"""p-value of whiteness below which thresholds are refused."""
-
-FORGETS = 1 - 1e-9
-"""Largest spectral radius of A - K C."""
+LAGS = 20  # lags of the whiteness test
+NOT_WHITE = 1e-3  # p-value of whiteness below which thresholds are refused
+FORGETS = 1 - 1e-9  # largest spectral radius of A - K C
 
 ADDED = 1e-2
 """Measurement noise, as a share of the innovations, that is added where the noise has no power at some frequency."""
 
-OTHER_SCALE = 1.3
-"""Ratio of the innovations to their predicted size above which thresholds are refused."""
+OTHER_SCALE = 1.3  # ratio of the innovations to their predicted size above which thresholds are refused
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,17 +148,11 @@ def predictor(model: "HammersteinSS") -> Predictor:
 
 @dataclass(frozen=True, eq=False)
 class Nuisance:
-    """(I + M M')^(-1/2) = I - U diag(1 - 1/sqrt(1 + s^2)) U' with the singular values s of M.
+    """(I + M M')^(-1/2) = I - U diag(1 - 1/sqrt(1 + s^2)) U' with the singular values s of M."""
 
-    Attributes:
-        U: (N l, q) orthonormal.
-        s: (q,).
-        unknown: number of unknown axes beside the initial state.
-    """
-
-    U: Array
-    s: Array
-    unknown: int = 0
+    U: Array  # (N l, q) orthonormal
+    s: Array  # (q,)
+    unknown: int = 0  # number of unknown axes beside the initial state
 
     @property
     def log_scale(self) -> float:

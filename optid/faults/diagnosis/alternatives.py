@@ -24,20 +24,14 @@ from optid.faults.signatures import Candidate, Dictionary, candidate_of
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
-UNLISTED = 0.1
-"""Prior of a fault outside the dictionary, relative to one inside."""
-
-LEAK = "bias"
-"""Kind of the disturbance of unknown direction that always competes."""
-
-UNKNOWN_DIRECTION = "process"
-"""Name of a disturbance whose direction is estimated."""
+UNLISTED = 0.1  # prior of a fault outside the dictionary, relative to one inside
+LEAK = "bias"  # kind of the disturbance of unknown direction that always competes
+UNKNOWN_DIRECTION = "process"  # name of a disturbance whose direction is estimated
 
 INTEGRATES = 1e10
 """Condition number above which the plant integrates: a constant disturbance has no steady-state effect."""
 
-EXACT = 1e-12
-"""Variance of a share lost that is known."""
+EXACT = 1e-12  # variance of a share lost that is known
 
 
 def with_unlisted_candidates(found: Dictionary) -> Dictionary | None:

@@ -21,8 +21,7 @@ from optid.faults.signatures import Candidate
 if TYPE_CHECKING:
     from optid.faults.search.scanning import Scan
 
-SMALL = 1e-3
-"""Singular values below which an error of a signature is neglected."""
+SMALL = 1e-3  # singular values below which an error of a signature is neglected
 
 
 def with_model_uncertainty(found: Explanation, uncertainty: ModelUncertainty | None) -> Explanation:

@@ -33,8 +33,7 @@ from optid.threads import one_thread
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
-KINDS = "bias", "loss", "spike"
-"""Kinds of faults of the default dictionary."""
+KINDS = "bias", "loss", "spike"  # kinds of faults of the default dictionary
 
 
 @one_thread

@@ -10,11 +10,8 @@ from optid.arrays import Array
 from optid.faults.diagnosis.answers import Remaining
 from optid.faults.whitening import Whitened
 
-UNFIT = 1e-3
-"""p-value of the residual below which an answer does not explain the record."""
-
-BURSTS = 1, 3, 10, 30
-"""Lengths, in samples, of the bursts searched for."""
+UNFIT = 1e-3  # p-value of the residual below which an answer does not explain the record
+BURSTS = 1, 3, 10, 30  # lengths, in samples, of the bursts searched for
 
 
 def remainder_test(whitened: Whitened, rest: Array, magnitudes: int, further: float = 1.0) -> Remaining:

@@ -18,23 +18,12 @@ from optid.faults.search.scanning import Scan, scan
 from optid.faults.signatures import Dictionary, candidate_of
 from optid.faults.whitening import Whitened
 
-BOUND = 2.5
-"""Standard deviations at which residuals are clipped."""
-
-WILD = 4.5
-"""Standard deviations from which on a spike is removed."""
-
-MOST = 0.05
-"""Largest share of the readings removed."""
-
-ROUNDS = 20
-"""Largest number of searches on clipped innovations."""
-
-AT_ONCE = 4
-"""Largest number of faults whose signatures are not clipped."""
-
-LIKELY = 5.0
-"""Least log-likelihood ratio of such a fault against the healthy plant."""
+BOUND = 2.5  # standard deviations at which residuals are clipped
+WILD = 4.5  # standard deviations from which on a spike is removed
+MOST = 0.05  # largest share of the readings removed
+ROUNDS = 20  # largest number of searches on clipped innovations
+AT_ONCE = 4  # largest number of faults whose signatures are not clipped
+LIKELY = 5.0  # least log-likelihood ratio of such a fault against the healthy plant
 
 
 def cleaned(

@@ -23,58 +23,33 @@ from optid.faults.signatures import Candidate
 if TYPE_CHECKING:
     from optid.faults.search.scanning import Scan
 
-SPREADS = 2.0, 4.0, 9.0, 25.0, 100.0, 400.0
-"""Squared deflections of the prior."""
-
-NEGLIGIBLE = 18.0
-"""Logarithm of the ratio to the largest probability below which onsets are left out."""
-
-MODEL_ERROR = 0.02
-"""Probability that a share lost outside [0, 1] is due to an error of the model."""
-
-HALVINGS = 60
-"""Bisections for a quantile of a mixture."""
+SPREADS = 2.0, 4.0, 9.0, 25.0, 100.0, 400.0  # squared deflections of the prior
+NEGLIGIBLE = 18.0  # logarithm of the ratio to the largest probability below which onsets are left out
+MODEL_ERROR = 0.02  # probability that a share lost outside [0, 1] is due to an error of the model
+HALVINGS = 60  # bisections for a quantile of a mixture
 
 
 class Explained(NamedTuple):
-    """Fit of an explanation to a window.
+    """Fit of an explanation to a window."""
 
-    Attributes:
-        fitted: (N, l) of the innovations.
-        rest: (N, l) residual, white noise where the explanation is right.
-        magnitudes: number of estimated magnitudes.
-    """
-
-    fitted: Array
-    rest: Array
-    magnitudes: int
+    fitted: Array  # (N, l) of the innovations
+    rest: Array  # (N, l) residual, white noise where the explanation is right
+    magnitudes: int  # number of estimated magnitudes
 
 
 class Explanation(NamedTuple):
-    """One set of candidates over its possible onsets.
+    """One set of candidates over its possible onsets."""
 
-    Attributes:
-        candidates: one or several.
-        onsets: (K, s) of each candidate.
-        logs: (K,) logarithms of the marginal likelihoods, the prior of the onsets included.
-        sizes: (K, d) magnitudes of all candidates by least squares, one after the other.
-        covariances: (K, d, d) for the onsets of the row.
-        energies: (K,) energy explained, or twice the gain in log-likelihood.
-        search: with the signatures; None for candidates without one.
-        course: in place of signatures, the fit to the window for an onset.
-        error: of the signature, due to the uncertainty of an identified model.
-        entries: the candidates of the search of which the candidates are special cases; empty where they are the same.
-    """
-
-    candidates: tuple[Candidate, ...]
-    onsets: np.ndarray
-    logs: Array
-    sizes: Array
-    covariances: Array
-    energies: Array
-    search: "Scan | None" = None
-    course: Callable[[int], Explained] | None = None
-    error: Nuisance | None = None
+    candidates: tuple[Candidate, ...]  # one or several
+    onsets: np.ndarray  # (K, s) of each candidate
+    logs: Array  # (K,) logarithms of the marginal likelihoods, the prior of the onsets included
+    sizes: Array  # (K, d) magnitudes of all candidates by least squares, one after the other
+    covariances: Array  # (K, d, d) for the onsets of the row
+    energies: Array  # (K,) energy explained, or twice the gain in log-likelihood
+    search: "Scan | None" = None  # with the signatures; None for candidates without one
+    course: Callable[[int], Explained] | None = None  # in place of signatures, the fit to the window for an onset
+    error: Nuisance | None = None  # of the signature, due to the uncertainty of an identified model
+    # the candidates of the search of which the candidates are special cases; empty where they are the same
     entries: tuple[Candidate, ...] = ()
 
     def without_negligible_onsets(self) -> "Explanation":

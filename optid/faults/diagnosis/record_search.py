@@ -26,20 +26,11 @@ if TYPE_CHECKING:
 
 METHODS = "exact", "sparse", "sparse+polish", "set"
 
-UNKNOWN_SHARE = 0.1
-"""Share of the false-alarm probability for deviations outside the dictionary."""
-
-COURSE_SHARE = 0.1
-"""Share for candidates without a signature, where there are some."""
-
-SIMULATED = 2_000_000
-"""Total of samples above which fewer windows are simulated."""
-
-LEAST = 4.0
-"""Least deflection of a complete loss beside a constant offset that is testable."""
-
-DRAWS, MOST_DRAWS = 20_000, 500_000
-"""Simulated windows for the thresholds of a short record, and the largest number."""
+UNKNOWN_SHARE = 0.1  # share of the false-alarm probability for deviations outside the dictionary
+COURSE_SHARE = 0.1  # share for candidates without a signature, where there are some
+SIMULATED = 2_000_000  # total of samples above which fewer windows are simulated
+LEAST = 4.0  # least deflection of a complete loss beside a constant offset that is testable
+DRAWS, MOST_DRAWS = 20_000, 500_000  # simulated windows for the thresholds of a short record, and the largest number
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,39 +60,22 @@ class Question:
 
 @dataclass(frozen=True, eq=False)
 class RecordSearch:
-    """One experiment, searched; `search_record` makes it.
+    """One experiment, searched; `search_record` makes it."""
 
-    Attributes:
-        record: of the experiment.
-        given: the experiment, without flat lines.
-        dictionary: the candidates.
-        asked: options.
-        noise: arguments of `whiten`: uncertainty and scale.
-        part: the experiment without outliers.
-        whitened: its innovations, clipped at outliers.
-        search: of the innovations; None where no candidate has a signature.
-        limits: thresholds of the search; None without a search.
-        gains: (C, N) statistics less thresholds; NaN where a candidate is not tested or not testable.
-        lost: {label: why} of candidates that are not testable.
-        healthy: residual of the healthy plant.
-        outliers: (sample, output) of the removed readings.
-        narrower: the search of the same readings with fewer candidates; None without one.
-    """
-
-    record: Data
-    given: Experiment
-    dictionary: Dictionary
-    asked: Question
-    noise: Mapping[str, Any]
-    part: Experiment
-    whitened: Whitened
-    search: Scan | None
-    limits: Thresholds | None
-    gains: Array
-    lost: dict[str, str]
-    healthy: "Remaining"
-    outliers: tuple[tuple[int, int], ...]
-    narrower: "RecordSearch | None" = None
+    record: Data  # of the experiment
+    given: Experiment  # the experiment, without flat lines
+    dictionary: Dictionary  # the candidates
+    asked: Question  # options
+    noise: Mapping[str, Any]  # arguments of `whiten`: uncertainty and scale
+    part: Experiment  # the experiment without outliers
+    whitened: Whitened  # its innovations, clipped at outliers
+    search: Scan | None  # of the innovations; None where no candidate has a signature
+    limits: Thresholds | None  # thresholds of the search; None without a search
+    gains: Array  # (C, N) statistics less thresholds; NaN where a candidate is not tested or not testable
+    lost: dict[str, str]  # {label: why} of candidates that are not testable
+    healthy: "Remaining"  # residual of the healthy plant
+    outliers: tuple[tuple[int, int], ...]  # (sample, output) of the removed readings
+    narrower: "RecordSearch | None" = None  # the search of the same readings with fewer candidates; None without one
 
     @property
     def tested(self) -> list[Candidate]:

@@ -21,26 +21,13 @@ from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.monitor.columns import Window
 
-ALARMS = 60
-"""False alarms of a simulation by default: their rate is then known to 13 %."""
-
-FEWEST = 50
-"""With fewer alarms than this the threshold is extrapolated, or refused."""
-
-LONGEST = 1_000_000
-"""Samples simulated at most by default."""
-
-CHUNK = 20_000
-"""Samples simulated at a time."""
-
-RUNS = 4
-"""Simulations that may run in parallel; the result does not depend on how many do."""
-
-COMMON = 0.1
-"""Share of blocks by whose energies a healthy record is compared with the simulation."""
-
-NODES = 80
-"""Nodes of the quadrature, for ten digits of the run lengths of the usual charts."""
+ALARMS = 60  # false alarms of a simulation by default: their rate is then known to 13 %
+FEWEST = 50  # with fewer alarms than this the threshold is extrapolated, or refused
+LONGEST = 1_000_000  # samples simulated at most by default
+CHUNK = 20_000  # samples simulated at a time
+RUNS = 4  # simulations that may run in parallel; the result does not depend on how many do
+COMMON = 0.1  # share of blocks by whose energies a healthy record is compared with the simulation
+NODES = 80  # nodes of the quadrature, for ten digits of the run lengths of the usual charts
 
 
 @dataclass(frozen=True, eq=False)

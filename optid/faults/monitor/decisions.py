@@ -30,17 +30,13 @@ the plant is where the model was not identified, and the model does not describe
 Excursion = Callable[[int, int], tuple[str, int] | None]
 """(since, before) -> channel that was far outside its range after `since`, and when it left it, `before` a sample."""
 
-AGAIN_AT = 1.25
-"""Growth of the samples since an onset after which the kind of a carried actuator is judged again."""
+AGAIN_AT = 1.25  # growth of the samples since an onset after which the kind of a carried actuator is judged again
 
 SEVERAL_AT = 2.0
 """Growth of the samples since an alarm that no candidate explains after which several faults are searched again."""
 
-UNKNOWN = "unknown"
-"""Label of a fault that no candidate explains."""
-
-NOTHING = -1
-"""No candidate is isolated."""
+UNKNOWN = "unknown"  # label of a fault that no candidate explains
+NOTHING = -1  # no candidate is isolated
 
 
 @dataclass(eq=False)

@@ -18,8 +18,7 @@ from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Predictor
 from optid.models.files import from_content, read_state, write_state
 
-VERSION = 6
-"""Version of the file."""
+VERSION = 6  # version of the file
 
 WORDS = "name", "kind", "columns", "members", "places", "bounded_deflection", "zero"
 PLACES = "into_state", "into_output"

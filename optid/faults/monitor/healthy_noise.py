@@ -19,14 +19,9 @@ from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.experiments import in_units_of
 from optid.phrases import p_equals
 
-FEWEST = 20
-"""Fewest windows of a healthy record."""
-
-ORDERS = 1, 2, 3, 4, 6, 8
-"""Orders of the autoregressions tried for innovations that are not white."""
-
-LONGEST = 3000
-"""Samples of the identification along which the effect of uncertain parameters is simulated."""
+FEWEST = 20  # fewest windows of a healthy record
+ORDERS = 1, 2, 3, 4, 6, 8  # orders of the autoregressions tried for innovations that are not white
+LONGEST = 3000  # samples of the identification along which the effect of uncertain parameters is simulated
 
 
 FOLLOWED, SLOWEST = 1 / 60, 600
@@ -35,8 +30,7 @@ FOLLOWED, SLOWEST = 1 / 60, 600
 RAISED, REFUSED = 3.0, 10.0
 """Factors by which a healthy record may raise energies: above the first one with a warning, above the second not."""
 
-BLOCK = 100
-"""Samples of the stretches whose energies are compared."""
+BLOCK = 100  # samples of the stretches whose energies are compared
 
 
 def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> tuple[Array, Array]:

@@ -37,14 +37,9 @@ if TYPE_CHECKING:
 
 KINDS_BY_DEFAULT = ("bias", "loss", "spike")
 
-INPUTS, HOLD = 20_000, 5
-"""Samples of simulated input for the calibration, and samples per level."""
-
-NORMAL = 1.96
-"""Standard deviations of the ends of a 95 % interval."""
-
-BLOCK = 4096
-"""Samples searched at a time."""
+INPUTS, HOLD = 20_000, 5  # samples of simulated input for the calibration, and samples per level
+NORMAL = 1.96  # standard deviations of the ends of a 95 % interval
+BLOCK = 4096  # samples searched at a time
 
 _KNOWN: dict[str, Calibration] = {}
 

@@ -8,8 +8,7 @@ from optid.faults.monitor.columns import Window
 from optid.faults.monitor.events import Event
 from optid.faults.monitor.rules import RULES
 
-FEWEST = 4
-"""Fewest samples of increased noise."""
+FEWEST = 4  # fewest samples of increased noise
 
 
 def noisy_sensor(now: int, window: Window, outputs: tuple[str, ...]) -> Event | None:

@@ -14,8 +14,7 @@ BEYOND = 1.1
 """Distance from the middle of the range, in half ranges, from which a channel is far outside it; a linear function of
 an input is extrapolated further."""
 
-REMEMBERED = 2
-"""Windows for which excursions are kept."""
+REMEMBERED = 2  # windows for which excursions are kept
 
 
 class Screened(NamedTuple):

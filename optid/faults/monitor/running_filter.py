@@ -32,11 +32,8 @@ SEEN = 1e-7
 WIDE = 1e10
 """Prior energy of an unknown input in all innovations: with none, a fault of its actuator would have no size at all."""
 
-DOUBLINGS = 24
-"""Doublings of the horizon over which the response to the state is taken."""
-
-CERTAIN = 1e-12
-"""Energy in one innovation below which the state is known."""
+DOUBLINGS = 24  # doublings of the horizon over which the response to the state is taken
+CERTAIN = 1e-12  # energy in one innovation below which the state is known
 
 
 @dataclass(eq=False)

@@ -26,14 +26,9 @@ from optid.faults.search.scanning import scan
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import whiten
 
-WINDOWS, BEFORE = 5, 1
-"""Windows of samples that are kept, and those of them before an onset that an estimate needs."""
-
-NEAR, MOST = 20, 3
-"""Samples on both sides of an onset that are tried, and the most faults that are estimated together."""
-
-COVERAGE = 0.95
-"""Of the intervals."""
+WINDOWS, BEFORE = 5, 1  # windows of samples that are kept, and those of them before an onset that an estimate needs
+NEAR, MOST = 20, 3  # samples on both sides of an onset that are tried, and the most faults that are estimated together
+COVERAGE = 0.95  # of the intervals
 
 
 class Recent:

@@ -13,27 +13,18 @@ from optid.faults.search.sweeps import inverse_roots
 if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
 
-MOST = 40_000_000
-"""Largest number of values of the atoms of a window."""
+MOST = 40_000_000  # largest number of values of the atoms of a window
 
 
 @dataclass(frozen=True, eq=False)
 class Atoms:
-    """The atoms of one candidate.
+    """The atoms of one candidate."""
 
-    Attributes:
-        label: of the candidate.
-        onsets: (T,) those that are tested.
-        axes: (T, N l, d) orthonormal columns; zero ones for directions without effect.
-        back: (T, d, d) magnitudes = back @ coefficients of the axes.
-        threshold: energy q above which the search raises an alarm for the candidate.
-    """
-
-    label: str
-    onsets: np.ndarray
-    axes: Array
-    back: Array
-    threshold: float
+    label: str  # of the candidate
+    onsets: np.ndarray  # (T,) those that are tested
+    axes: Array  # (T, N l, d) orthonormal columns; zero ones for directions without effect
+    back: Array  # (T, d, d) magnitudes = back @ coefficients of the axes
+    threshold: float  # energy q above which the search raises an alarm for the candidate
 
     @property
     def dimension(self) -> int:

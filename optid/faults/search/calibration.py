@@ -12,11 +12,8 @@ from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened
 from optid.models.experiments import samples_of
 
-EXCEEDING = 50
-"""Least number of simulated windows that exceed the thresholds."""
-
-STRETCHES = 100
-"""Number of sections drawn from a longer input."""
+EXCEEDING = 50  # least number of simulated windows that exceed the thresholds
+STRETCHES = 100  # number of sections drawn from a longer input
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,7 @@ from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
 from optid.phrases import short
 
-ALIKE = 2e-6
-"""One less the squared cosine of two signatures below which they are indistinguishable."""
+ALIKE = 2e-6  # one less the squared cosine of two signatures below which they are indistinguishable
 
 
 class Magnitude(NamedTuple):

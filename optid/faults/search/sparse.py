@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from optid.core.problem import Problem
     from optid.program.solution import Solution
 
-REACH = 10
-"""Onsets on either side of an active one that are searched exactly, for every candidate."""
+REACH = 10  # onsets on either side of an active one that are searched exactly, for every candidate
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,18 +23,10 @@ if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
     from optid.faults.search.pair_kernels import Grams
 
-MOST = 1_250_000_000
-"""Largest number of subsets searched."""
-
-EXCHANGED = 3
-"""Number of subsets improved by exchanges."""
-
-ROUNDS = 20
-"""Largest number of rounds of exchanges."""
-
-
-Member = tuple[int, int]
-"""Number of a candidate and its onset."""
+MOST = 1_250_000_000  # largest number of subsets searched
+EXCHANGED = 3  # number of subsets improved by exchanges
+ROUNDS = 20  # largest number of rounds of exchanges
+Member = tuple[int, int]  # number of a candidate and its onset
 
 
 class Subset(NamedTuple):
