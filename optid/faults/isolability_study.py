@@ -28,15 +28,10 @@ MIDDLE = 0.3, 0.7  # range of a random onset, as shares of the window
 
 
 class Forecast(NamedTuple):
-    """Probabilities of detection and isolation of a fault of a given size.
+    """Probabilities of detection and isolation of a fault of a given size."""
 
-    Attributes:
-        detected: probability of an alarm.
-        isolated: probability of an alarm with the right candidate.
-    """
-
-    detected: float
-    isolated: float
+    detected: float  # probability of an alarm
+    isolated: float  # probability of an alarm with the right candidate
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -72,26 +72,18 @@ DIFFUSE = 1e6  # standard deviation of an unknown initial state, relative to its
 
 @dataclass(frozen=True, eq=False)
 class ModelUncertainty:
-    """The covariance of the parameters of an identified model.
+    """The covariance of the parameters of an identified model."""
 
-    Attributes:
-        model: the model, with the gain of the predictor.
-        predictor: of the noise with the corrections for a short record; used for windows.
-        root: (parameters, q) with covariance root root'.
-        readings: number of readings behind it, less one for each initial state estimated.
-        inflation: factor of the covariance, from a healthy record or from the sections of the identification.
-        levels: (2, l) lowest and highest readings of the identification; None for a model that is exact.
-        deviation: of the parameters from the most likely ones, in standard deviations; 0 where it is not significant.
-        curvature: the products whose coefficients are the last parameters; None where they are zero.
-    """
-
-    model: "HammersteinSS"
-    predictor: Predictor
-    root: Array
-    readings: int
-    inflation: float = 1.0
+    model: "HammersteinSS"  # the model, with the gain of the predictor
+    predictor: Predictor  # of the noise with the corrections for a short record; used for windows
+    root: Array  # (parameters, q) with covariance root root'
+    readings: int  # number of readings behind it, less one for each initial state estimated
+    inflation: float = 1.0  # factor of the covariance, from a healthy record or from the sections of the identification
+    # (2, l) lowest and highest readings of the identification; None for a model that is exact
     levels: Array | None = None
+    # of the parameters from the most likely ones, in standard deviations; 0 where it is not significant
     deviation: float = 0.0
+    # the products whose coefficients are the last parameters; None where they are zero
     curvature: Products | None = None
 
     @cached_property

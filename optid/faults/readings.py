@@ -40,23 +40,14 @@ class SensorFinding(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LostReadings:
-    """A stretch of a record in which a sensor is frozen, saturated or dead.
+    """A stretch of a record in which a sensor is frozen, saturated or dead."""
 
-    Attributes:
-        name: "sensor:y1".
-        condition: "frozen", "saturated" or "dead".
-        experiment: index of the experiment.
-        first: first sample of the equal readings or of the missing ones.
-        count: number of these readings.
-        value: the reading; NaN of a dead sensor.
-    """
-
-    name: str
-    condition: str
-    experiment: int
-    first: int
-    count: int
-    value: float
+    name: str  # "sensor:y1"
+    condition: str  # "frozen", "saturated" or "dead"
+    experiment: int  # index of the experiment
+    first: int  # first sample of the equal readings or of the missing ones
+    count: int  # number of these readings
+    value: float  # the reading; NaN of a dead sensor
 
     @property
     def is_dead(self) -> bool:

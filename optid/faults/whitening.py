@@ -31,25 +31,15 @@ OTHER_SCALE = 1.3  # ratio of the innovations to their predicted size above whic
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
-    """The steady predictor of a model, x+ = A x + ... + K (y - C x - ...).
+    """The steady predictor of a model, x+ = A x + ... + K (y - C x - ...)."""
 
-    Attributes:
-        A: (n, n) of the model.
-        C: (l, n) of the model.
-        L: (n, l) output injection of the model.
-        K: (n, l) gain.
-        covariance: (l, l) of the innovations.
-        root: (l, l) lower triangular; root times an innovation has unit covariance.
-        silent: number of axes of the innovations left out, because declared disturbances affect them.
-    """
-
-    A: Array
-    C: Array
-    L: Array
-    K: Array
-    covariance: Array
-    root: Array
-    silent: int = 0
+    A: Array  # (n, n) of the model
+    C: Array  # (l, n) of the model
+    L: Array  # (n, l) output injection of the model
+    K: Array  # (n, l) gain
+    covariance: Array  # (l, l) of the innovations
+    root: Array  # (l, l) lower triangular; root times an innovation has unit covariance
+    silent: int = 0  # number of axes of the innovations left out, because declared disturbances affect them
 
     @property
     def F(self) -> Array:  # noqa: N802 - the field's letter
@@ -181,24 +171,16 @@ class UncertainInnovations(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """Whitened innovations of one record.
+    """Whitened innovations of one record."""
 
-    Attributes:
-        r: (N, l), zero where a reading is missing; N(0, I) for a healthy plant.
-        innovations: (N, l) before whitening, NaN where a reading is missing.
-        present: (N, l) whether there is a reading.
-        predictor: the predictor behind them.
-        outputs: names of the outputs.
-        nuisance: effect of uncertain parameters on the innovations, removed from r; None for a model taken as exact.
-        states: (N, n) of the predictor, for faults that change the matrices; None where they are not known.
-    """
-
-    r: Array
-    innovations: Array
-    present: Array
-    predictor: Predictor
-    outputs: tuple[str, ...]
+    r: Array  # (N, l), zero where a reading is missing; N(0, I) for a healthy plant
+    innovations: Array  # (N, l) before whitening, NaN where a reading is missing
+    present: Array  # (N, l) whether there is a reading
+    predictor: Predictor  # the predictor behind them
+    outputs: tuple[str, ...]  # names of the outputs
+    # effect of uncertain parameters on the innovations, removed from r; None for a model taken as exact
     nuisance: Nuisance | None = None
+    # (N, n) of the predictor, for faults that change the matrices; None where they are not known
     states: Array | None = None
 
     def whiten_signature(self, signature: Array) -> Array:
@@ -282,21 +264,13 @@ def whiten(
 
 @dataclass(frozen=True, eq=False)
 class Health:
-    """Whiteness and size of the innovations of a healthy record, compared with the model.
+    """Whiteness and size of the innovations of a healthy record, compared with the model."""
 
-    Attributes:
-        ratios: {output: size of its innovations over the predicted one}.
-        p_value: of the hypothesis that the innovations are white (portmanteau test of Hosking).
-        lags: its lags.
-        samples: number of complete samples.
-        covariance: (l, l) of the whitened innovations; the identity is expected.
-    """
-
-    ratios: dict[str, float]
-    p_value: float
-    lags: int
-    samples: int
-    covariance: Array
+    ratios: dict[str, float]  # {output: size of its innovations over the predicted one}
+    p_value: float  # of the hypothesis that the innovations are white (portmanteau test of Hosking)
+    lags: int  # its lags
+    samples: int  # number of complete samples
+    covariance: Array  # (l, l) of the whitened innovations; the identity is expected
 
     @property
     def ratio(self) -> float:

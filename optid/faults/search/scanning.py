@@ -19,15 +19,10 @@ ALIKE = 2e-6  # one less the squared cosine of two signatures below which they a
 
 
 class Magnitude(NamedTuple):
-    """The magnitudes of a fault by least squares.
+    """The magnitudes of a fault by least squares."""
 
-    Attributes:
-        nu: (d,) magnitudes; zero along directions without effect.
-        covariance: (d, d) for this candidate and onset, without the search for the onset.
-    """
-
-    nu: Array
-    covariance: Array
+    nu: Array  # (d,) magnitudes; zero along directions without effect
+    covariance: Array  # (d, d) for this candidate and onset, without the search for the onset
 
 
 @dataclass(frozen=True, eq=False)

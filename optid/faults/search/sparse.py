@@ -22,19 +22,12 @@ REACH = 10  # onsets on either side of an active one that are searched exactly, 
 
 @dataclass(frozen=True, eq=False)
 class ActiveGroup:
-    """One active candidate at one onset.
+    """One active candidate at one onset."""
 
-    Attributes:
-        label: of the candidate.
-        onset: first sample that it changes.
-        size: (d,) magnitudes, shrunk by the penalty: not an estimate.
-        deflection: norm of the whitened signature, shrunk, too.
-    """
-
-    label: str
-    onset: int
-    size: Array
-    deflection: float
+    label: str  # of the candidate
+    onset: int  # first sample that it changes
+    size: Array  # (d,) magnitudes, shrunk by the penalty: not an estimate
+    deflection: float  # norm of the whitened signature, shrunk, too
 
 
 @dataclass(frozen=True, eq=False)

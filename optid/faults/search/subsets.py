@@ -30,19 +30,12 @@ Member = tuple[int, int]  # number of a candidate and its onset
 
 
 class Subset(NamedTuple):
-    """A few faults.
+    """A few faults."""
 
-    Attributes:
-        labels: of the candidates, in the order of the dictionary and of the onsets.
-        onsets: of each.
-        gain: energy explained less all thresholds.
-        energy: energy explained.
-    """
-
-    labels: tuple[str, ...]
-    onsets: tuple[int, ...]
-    gain: float
-    energy: float
+    labels: tuple[str, ...]  # of the candidates, in the order of the dictionary and of the onsets
+    onsets: tuple[int, ...]  # of each
+    gain: float  # energy explained less all thresholds
+    energy: float  # energy explained
 
     def __str__(self) -> str:
         """State candidates and onsets."""
