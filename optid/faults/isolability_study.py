@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 
 from optid.arrays import Array, check_integer
 from optid.errors import DataError, LookupFailed, StructureError, nearest
-from optid.faults.search.calibration import check_draws, family_thresholds
+from optid.faults.false_alarms import check_draws, family_thresholds
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Dictionary
 from optid.registry import Rendered

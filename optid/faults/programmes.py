@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from optid.data.record import Data
     from optid.faults.consistency.bounded_noise import Membership
     from optid.faults.consistency.profiles import Profile
-    from optid.faults.search.calibration import Thresholds
+    from optid.faults.false_alarms import Thresholds
     from optid.faults.search.scanning import Scan
     from optid.faults.search.sparse import SparseResult
     from optid.faults.signatures import Dictionary

@@ -1,9 +1,11 @@
-"""Inputs outside the range over which a function was identified, where the effect of the actuator is unknown.
+"""Channels outside the range of the identification: how far, since when, and what of a record is used then.
 
-A linear function is extrapolated, for which the covariance of its parameters accounts, up to `FAR` half ranges from the
-middle of its range; a nonlinear one is known inside its range. Beyond, the effect f(u) is modelled as a disturbance of
-unlimited variance, which is removed from innovations and signatures like the unknown initial state. A record in which a
-linear input stays there, or which is outside too often, is used up to that sample.
+What a model of a smooth plant lacks grows with the distance from the middle of the range. The effect of an actuator is
+unknown where its input is outside the range over which its function was identified. A linear function is extrapolated,
+for which the covariance of its parameters accounts, up to `FAR` half ranges from the middle; a nonlinear one is known
+inside its range. Beyond, the effect f(u) is modelled as a disturbance of unlimited variance, which is removed from
+innovations and signatures like the unknown initial state. A record in which a linear input stays there, or which is
+outside too often, is used up to that sample.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -24,6 +26,21 @@ REACH = 50  # samples of the impulse response that are considered
 MOST = 400  # largest number of samples outside
 FAR = 1.5  # distance from the middle of the range, in half ranges, up to which a linear function is extrapolated
 STAY = 3  # samples in a row outside, from which on a record is not used
+BEYOND = 1.1  # distance from the middle of its range, in half ranges, from which a channel is far outside it
+
+
+def distance(values: Array, ends: Array | None) -> Array:
+    """Return how far values (N, c) are from the middle of ranges (2, c), in half ranges; one inside.
+
+    One value only is no range, nor is an infinite one, nor None; a missing value is inside.
+    """
+    if ends is None:
+        return np.ones(values.shape)
+    low, high = ends
+    with np.errstate(invalid="ignore"):
+        span = np.where(np.isfinite(high - low) & (high > low), high - low, np.inf)
+        far = np.abs(2 * values - low - high) / span
+    return np.where((values < low) | (values > high), np.fmax(far, 1.0), 1.0)
 
 
 class Outside(NamedTuple):
@@ -123,6 +140,14 @@ def known_range(model: "HammersteinSS") -> tuple[Array, Array]:
         room *= min(1.0, float(np.min(UNSEEN * noise / np.maximum(seen, 1e-300))))
         low[column], high[column] = first - room, last + room
     return low, high
+
+
+def by_input(model: "HammersteinSS", ends: tuple[Array, Array]) -> Array:
+    """Return ranges (2, m) of the inputs, from those of their functions, low and high (K,); infinite without any."""
+    found = np.full((2, model.m), np.inf) * [[-1.0], [1.0]]
+    np.maximum.at(found[0], list(model.input_of), ends[0])
+    np.minimum.at(found[1], list(model.input_of), ends[1])
+    return found
 
 
 def unsure_since(model: "HammersteinSS", u: Array, memory: int) -> np.ndarray:

@@ -23,10 +23,10 @@ from optid.faults.diagnosis.records import (
     uncertainty_of,
     without_lost_readings,
 )
+from optid.faults.false_alarms import Thresholds
 from optid.faults.nuisance import uncertain_start
 from optid.faults.ranges import input_range_notes, outside, usable_samples
 from optid.faults.screening import check_channels
-from optid.faults.search.calibration import Thresholds
 from optid.faults.signatures import Dictionary, dictionary
 from optid.threads import one_thread
 

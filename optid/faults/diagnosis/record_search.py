@@ -16,7 +16,8 @@ from optid.faults.diagnosis.leftover import alarm_probability, remainder_test
 from optid.faults.diagnosis.outliers import cleaned, with_spikes
 from optid.faults.diagnosis.posterior import Explanation
 from optid.faults.diagnosis.sensor_gains import sensor_gains
-from optid.faults.search.calibration import EXCEEDING, Thresholds, thresholds
+from optid.faults.false_alarms import EXCEEDING, Thresholds
+from optid.faults.search.calibration import thresholds
 from optid.faults.search.scanning import Scan, scan
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, whiten

@@ -9,15 +9,14 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.faults.diagnosis.answers import FaultAnswer
+from optid.faults.false_alarms import common_excess
 from optid.faults.monitor.actuator_kinds import groups_of, is_grouped, kinds, likeliest
-from optid.faults.monitor.arl import COMMON
 from optid.faults.monitor.columns import Columns, Window
 from optid.faults.monitor.events import Event
 from optid.faults.monitor.noisy_sensor import excess, noisy_sensor
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT
 from optid.faults.monitor.sizes import Recent
-from optid.faults.nuisance import CONFIDENCE
 from optid.faults.signatures import Candidate
 
 WINDOWS, CHANGED = 40, 0.2
@@ -126,15 +125,12 @@ class Decisions:
 
     def adapt(self, now: int) -> list[Event]:
         """Adapt the thresholds to the colour of the noise at the end of a window; return what has changed."""
-        from scipy.special import bdtrik
-
         if self.phase == WATCHING or self.highest > 1:
             self.windows = [*self.windows, self.highest][-WINDOWS:]
-        self.highest, found, before = 0.0, np.array(self.windows), self.adapted
-        factor = 1.0
-        if len(found) >= WINDOWS // 2 and np.sum(found > self.common) > bdtrik(CONFIDENCE, len(found), COMMON):
-            factor = float(np.clip(np.quantile(found, 1 - COMMON) / self.common, 1.0, self.rules["adapt"]))
-        if abs(np.log(factor / before)) < CHANGED:
+        self.highest, factor = 0.0, 1.0
+        if len(self.windows) >= WINDOWS // 2:
+            factor = min(common_excess(np.array(self.windows), self.common), self.rules["adapt"])
+        if abs(np.log(factor / self.adapted)) < CHANGED:
             return []
         self.adapted = factor
         note = (f"thresholds times {factor:.2f} for the colour of the noise: a fault must be {np.sqrt(factor):.2f} "

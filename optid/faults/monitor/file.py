@@ -7,7 +7,7 @@ import numpy as np
 
 from optid.errors import ModelFileError
 from optid.faults.curvature import Products
-from optid.faults.monitor.arl import Calibration
+from optid.faults.false_alarms import Calibration
 from optid.faults.monitor.columns import Window
 from optid.faults.monitor.decisions import Decisions
 from optid.faults.monitor.events import Carried

@@ -1,8 +1,6 @@
 """The monitor: the search for faults on a stream, sample by sample."""
 
-import hashlib
 import warnings
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,14 +11,15 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.faults.false_alarms import Calibration, given_thresholds, raise_thresholds
 from optid.faults.kinds import DRIFT
 from optid.faults.monitor import file
 from optid.faults.monitor.actuator_kinds import searched
-from optid.faults.monitor.arl import Calibration, calibrate
+from optid.faults.monitor.arl import calibrate, reference_inputs
 from optid.faults.monitor.columns import SPARE, Window, columns_of
 from optid.faults.monitor.decisions import NAMING, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
-from optid.faults.monitor.healthy_noise import parameter_effect, raise_thresholds, with_noise_of, without_drift
+from optid.faults.monitor.healthy_noise import parameter_effect, with_noise_of, without_drift
 from optid.faults.monitor.readings import ReadingChecks
 from optid.faults.monitor.rules import RULES
 from optid.faults.monitor.running_filter import RunningFilter
@@ -37,11 +36,8 @@ if TYPE_CHECKING:
 
 KINDS_BY_DEFAULT = ("bias", "loss", "spike")
 
-INPUTS, HOLD = 20_000, 5  # samples of simulated input for the calibration, and samples per level
 NORMAL = 1.96  # standard deviations of the ends of a 95 % interval
 BLOCK = 4096  # samples searched at a time
-
-_KNOWN: dict[str, Calibration] = {}
 
 
 class Monitor:
@@ -132,10 +128,14 @@ class Monitor:
             if c.label in self.skipped and not c.is_sensor_gain:  # the gains of sensors are among the kinds by default
                 warnings.warn(f"{c.label} is not monitored: {self.skipped[c.label]}.", DataWarning, stacklevel=2)
         if thresholds is not None:
-            self.calibration = self._given(thresholds, arl0)
+            self.calibration = given_thresholds(thresholds, self.labels, arl0, self.window)
         else:
-            f = self._simulate_reference(u) if inputs is None else inputs
-            self.calibration = self._simulated(f, effect, arl0, samples=samples, extrapolate=extrapolate)
+            if inputs is None:
+                inputs = np.zeros((0, found.model.B.shape[1]))
+                if self.columns.losses:
+                    inputs = reference_inputs(found.model, u, self.window, seed)
+            self.calibration = calibrate(self.search, inputs, arl0, samples=samples, seed=seed, extrapolate=extrapolate,
+                                         effect=effect)
             if healthy is not None:
                 self.calibration = raise_thresholds(self.calibration, found.model, healthy, self.watched)
         self._use(self.calibration)
@@ -179,52 +179,6 @@ class Monitor:
         if own.rules["adapt"] > 1 and not np.isfinite(found.common):
             raise StructureError("adapt: thresholds that are given have no simulated windows to compare with; leave "
                                  "either out.")
-
-    def _simulated(self, f: Array, effect: Array | None, arl0: float, **how: Any) -> Calibration:
-        c = self.columns
-        key = hashlib.sha256(repr((self.labels, float(arl0), self.seed, self.window, how)).encode())
-        losses = [part for pair in c.losses for part in pair]
-        for part in (f, np.array([]) if effect is None else effect, c.into_state, c.into_output, c.course, *losses,
-                     *self.search.matrices):
-            key.update(np.ascontiguousarray(part).tobytes())
-        name = key.hexdigest()
-        if name not in _KNOWN:
-            _KNOWN[name] = calibrate(self.search, f, arl0, seed=self.seed, effect=effect, **how)
-        return _KNOWN[name]
-
-    def _given(self, thresholds: Any, arl0: float) -> Calibration:
-        if isinstance(thresholds, Calibration):
-            if thresholds.labels != self.labels or thresholds.window != self.window:
-                raise StructureError(
-                    f"thresholds: they are those of {', '.join(thresholds.labels)} in a window of "
-                    f"{thresholds.window}; this monitor searches for {', '.join(self.labels)} in {self.window}.")
-            return thresholds
-        if isinstance(thresholds, Mapping):
-            missing = [label for label in self.labels if label not in thresholds]
-            if missing:
-                raise StructureError(f"thresholds: none for {', '.join(missing)}.")
-            thresholds = [thresholds[label] for label in self.labels]
-        q = np.array(thresholds, dtype=float)
-        if q.shape != (len(self.labels),) or not np.all(q > 0):
-            raise StructureError(f"thresholds: give one positive number for each of {', '.join(self.labels)}.")
-        return Calibration(self.labels, q, float(arl0), self.window, 0, 0, None, np.ones(len(q)))
-
-    def _simulate_reference(self, u: ArrayLike | None) -> Array:
-        model = self.dictionary.model
-        if not self.columns.losses:
-            return np.zeros((0, model.B.shape[1]))
-        if u is not None:
-            inputs = np.asarray(u, dtype=float).reshape(len(np.asarray(u)), -1)
-            if inputs.shape[1] != model.m or not np.isfinite(inputs).all() or len(inputs) < self.window:
-                raise DataError(
-                    f"u has shape {np.shape(u)}; give {self.window} samples or more of {model.m} inputs.")
-            return model.expand_inputs(inputs)
-        spans = [(-1.0, 1.0)] * model.m
-        for c, nonlinearity in zip(model.input_of, model.nonlinearities):
-            spans[c] = nonlinearity.basis.interval or spans[c]
-        low, high = np.array(spans).T
-        drawn = np.random.default_rng(self.seed).uniform(low, high, (INPUTS // HOLD, model.m))
-        return model.expand_inputs(np.repeat(drawn, HOLD, axis=0))
 
     # -- samples -------------------------------------------------------------------------------------------------
 

@@ -11,7 +11,7 @@ from optid.faults.search.scanning import Scan
 from optid.faults.search.sweeps import inverse_roots
 
 if TYPE_CHECKING:
-    from optid.faults.search.calibration import Thresholds
+    from optid.faults.false_alarms import Thresholds
 
 MOST = 40_000_000  # largest number of values of the atoms of a window
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import LookupFailed, StructureError, nearest
-from optid.faults.search.calibration import Thresholds
+from optid.faults.false_alarms import Thresholds
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window

@@ -20,7 +20,7 @@ from optid.faults.search.scanning import ALIKE, Magnitude, Scan
 from optid.faults.search.sweeps import Sweep
 
 if TYPE_CHECKING:
-    from optid.faults.search.calibration import Thresholds
+    from optid.faults.false_alarms import Thresholds
     from optid.faults.search.pair_kernels import Grams
 
 MOST = 1_250_000_000  # largest number of subsets searched
