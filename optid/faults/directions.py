@@ -65,8 +65,7 @@ def decouple(
     if silent >= model.l:
         raise StructureError(
             f"The disturbances {', '.join(disturbances)} of any course cover all outputs ({', '.join(model.outputs)}): "
-            "nothing is left to judge. Declare fewer of them, or add a sensor."
-        )
+            "nothing is left to judge. Declare fewer of them, or add a sensor.")
     assert model.noise is not None
     E, F, noise = UNLIMITED * E / sizes, UNLIMITED * F / sizes, model.noise
     louder = replace(model, noise=replace(noise, Q=noise.Q + E @ E.T, R=noise.R + F @ F.T, S=noise.S + E @ F.T))

@@ -155,8 +155,7 @@ def check_draws(false_alarm: float, draws: int) -> None:
     if false_alarm * draws < EXCEEDING:
         raise DataError(
             f"{draws} simulated windows are too few for a false alarm in {1 / false_alarm:.3g}: use at least "
-            f"{int(np.ceil(EXCEEDING / false_alarm))} draws, or a higher probability."
-        )
+            f"{int(np.ceil(EXCEEDING / false_alarm))} draws, or a higher probability.")
 
 
 def family_thresholds(statistics: Array, false_alarm: float) -> Array:
@@ -253,19 +252,8 @@ def raise_thresholds(base: Calibration, model: "HammersteinSS", healthy: Data,
 
     The factor is one, unless more than a tenth of the windows reach the energies that a tenth of the simulated ones
     reach, or there are more alarms than in 95 % of records of this length; then it is the ratio of these energies, or
-    the one that leaves so many alarms.
-
-    Args:
-        base: the thresholds of the monitor.
-        model: the model that it uses.
-        healthy: the record.
-        watched: returns the statistics (N, C) along inputs (N, m) and readings (N, l).
-
-    Raises:
-        DataError: a record of fewer than 20 windows; a factor above 10.
-
-    Warns:
-        DataWarning: a factor above 3.
+    the one that leaves so many alarms. `watched` returns the statistics (N, C) of the monitor along inputs (N, m) and
+    readings (N, l). A record of fewer than `RECORDED` windows is a `DataError`; others as of `check_rise`.
     """
     from scipy.special import pdtrik
 

@@ -80,8 +80,7 @@ class FaultyPlant:
         if size.shape != (into_state.shape[1],):
             raise StructureError(
                 f"{name}: size of shape {size.shape}; this place has {into_state.shape[1]} columns: give one entry "
-                "for each."
-            )
+                "for each.")
         added = np.zeros(len(self.jolt))
         added[self.now] = course(np.arange(self.now.stop - self.now.start))
         if name.startswith("actuator:"):  # through B(k), which may be scheduled

@@ -71,8 +71,7 @@ def inject(
     seeds = np.random.SeedSequence(seed).spawn(len(records)) if len(records) > 1 else [seed]
     return one_or_all([
         trajectory(model, inputs, faults, seed=own, surroundings=surroundings).y
-        for (inputs, _, _), own in zip(records, seeds)
-    ])
+        for (inputs, _, _), own in zip(records, seeds)])
 
 
 def trajectory(
@@ -88,8 +87,7 @@ def trajectory(
         raise StructureError(f"feedback={feedback!r}: use 'measured' or 'true'.")
     if not model.parts.tables.compiled:
         raise StructureError(
-            "The feedback has functions of the user, which cannot be compiled. Fit them by another basis first."
-        )
+            "The feedback has functions of the user, which cannot be compiled. Fit them by another basis first.")
     inputs = records_of(model, [np.asarray(u)])[0][0][0]
     check_inputs(model, inputs, "")
     broken = [faults] if isinstance(faults, Fault) else list(faults)
@@ -103,8 +101,7 @@ def trajectory(
     if ended != INSIDE:
         raise DataError(
             f"At sample {at} the output leaves the interval of a feedback basis with outside='error'."
-            if ended == REFUSED else f"The faulty plant leaves the range of numbers at sample {at}: it is unstable."
-        )
+            if ended == REFUSED else f"The faulty plant leaves the range of numbers at sample {at}: it is unstable.")
     return Trajectory(readings, states)
 
 
@@ -132,8 +129,7 @@ def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> Noise
     if model.noise is None:
         raise StructureError(
             "The model has no noise covariances: estimate them with optid.noise.with_noise(model, data), or pass "
-            "noise='none' for a run without noise."
-        )
+            "noise='none' for a run without noise.")
     return model.noise
 
 

@@ -134,8 +134,7 @@ def isolability(
     if window * found.model.l * draws > NUMBERS:
         raise StructureError(
             f"window={window}: {draws} simulated windows of this length do not fit in memory: use at most "
-            f"{NUMBERS // (found.model.l * draws)} samples, or fewer draws."
-        )
+            f"{NUMBERS // (found.model.l * draws)} samples, or fewer draws.")
     if not 0.5 <= prob < 1:
         raise StructureError(f"prob={prob!r}; it must be a probability from 0.5 to below 1.")
     if isinstance(onset, str) and onset != "unknown":
@@ -228,8 +227,7 @@ def _directions(
     if not values[-1] > 0:
         raise DataError(
             f"{space.found.labels[c]}: untestable, the input does not excite it after sample {onset}. Use a window in "
-            "which it moves."
-        )
+            "which it moves.")
     d = values.size
     if d == 1:
         unit = float(np.sqrt(values[0]))

@@ -130,8 +130,7 @@ class ModelUncertainty:
         for j, (plus, minus, factor) in enumerate(self.moves):
             first, second = (
                 simulation.run(simulation.prepare_run(moved, "predict", part.u, part.y, None, ""), x0)
-                for moved in (plus, minus)
-            )
+                for moved in (plus, minus))
             columns[:, :, j] = np.where(present, (second - first) * factor, 0.0)
         if self.curvature is not None:
             more = self.root[len(self.root) - self.curvature.coefficients(self.model.nx) :]
@@ -148,14 +147,10 @@ class ModelUncertainty:
 
     def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True,
                  seen: Callable[[Array], Array] | None = None) -> Nuisance:
-        """Return the effect of the uncertainty on the whitened innovations of a record.
+        """Return the effect of the uncertainty on the whitened innovations of a record with some readings `present`.
 
-        Args:
-            part: the record, in raw units.
-            x0: (n,) its initial state.
-            present: (N, l) whether there is a reading.
-            free_start: whether the initial state is unknown, because it was estimated from this record.
-            seen: what whitens changes (N, l, d) of the innovations; the predictor by default.
+        With `free_start` its initial state (n,) is unknown, because it was estimated from it. Changes (N, l, d) of the
+        innovations are whitened by `seen`, by default the predictor.
         """
 
         def diffuse(changes: Array) -> Array:
@@ -288,8 +283,7 @@ def _estimated(gathered: Gathered, size: int) -> Estimated:
     if readings < 2 * int(known.sum()):
         raise DataError(
             f"{readings} readings (beside the initial states) do not determine the parameters well enough for a "
-            f"covariance of the model: {int(known.sum())} directions change its predictions. Use a longer record."
-        )
+            f"covariance of the model: {int(known.sum())} directions change its predictions. Use a longer record.")
     scale = float(np.sqrt(gathered.energy / (readings - int(known.sum()))))
     unit = axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
     grams = [[unit.T @ gram[:size, :size] @ unit for gram, _ in one] for one in gathered.sections]
@@ -318,9 +312,8 @@ def _operating_point(y: Array) -> Array:
 def overdispersion(grams: Sequence[Array], correlations: Sequence[Array]) -> float:
     """Return the factor c of the covariance of parameters that vary between sections; 1 where they need not vary.
 
-    Args:
-        grams: for each section S'S (q, q), the sensitivity S to parameters of unit covariance; their sum is at most I.
-        correlations: for each section S'r (q,) with its whitened innovations r.
+    Of each section are given S'S (q, q), S being the sensitivity to parameters of unit covariance, and S'r (q,) with
+    its whitened innovations r; the sum of the S'S is at most I.
     """
     spreads, squares = [], []
     for gram, along in zip(grams, correlations):
@@ -355,11 +348,8 @@ def largest_factor(s2: Array, z2: Array) -> float:
     """Return the upper bound of the factor c of the variances 1 + c s^2, at least one.
 
     It is the largest c for which so small an energy has a probability of 1 - `CONFIDENCE`, the axes weighted by their
-    information on c near one: exact for Gaussian innovations that are linear in the parameters.
-
-    Args:
-        s2: (q,) squared singular values of the nuisance.
-        z2: (q,) squared whitened innovations along its axes.
+    information on c near one: exact for Gaussian innovations that are linear in the parameters. s2 (q,) are squared
+    singular values of the nuisance, z2 (q,) squared whitened innovations along its axes.
     """
     weights, factors = s2 / (1 + s2) ** 2, np.geomspace(*FACTORS)
     drawn = np.random.default_rng(0).chisquare(1, (DRAWS, s2.size))
@@ -385,8 +375,7 @@ def parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], 
     def back(theta: Array) -> "HammersteinSS":
         cut = [theta[a:b] for a, b in zip(edges, edges[1:])]
         changes: dict[str, Any] = {
-            name: part.reshape(np.shape(getattr(model, name))) for name, part in zip(used, cut)
-        }
+            name: part.reshape(np.shape(getattr(model, name))) for name, part in zip(used, cut)}
         moved = [replace(f, mu=part) for f, part in zip(functions, cut[len(used) :])]
         inputs = len(model.nonlinearities)
         return replace(model, nonlinearities=tuple(moved[:inputs]), feedback=tuple(moved[inputs:]), **changes)

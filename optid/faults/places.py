@@ -51,14 +51,12 @@ def place_of(model: "HammersteinSS", name: str, direction: Any = None,
         columns = columns[:, None] if columns.ndim == 1 else columns
         if columns.ndim != 2 or len(columns) != n or not columns.any() or not np.isfinite(columns).all():
             raise StructureError(
-                f"{name}: direction of shape {np.shape(direction)}; it must be ({n},), finite and not zero."
-            )
+                f"{name}: direction of shape {np.shape(direction)}; it must be ({n},), finite and not zero.")
         return columns, np.zeros((l, columns.shape[1]))
     if place in ("process", "state") and not channel:
         return np.eye(n), np.zeros((l, n))
     raise LookupFailed(
-        f"{name!r}: a fault is named 'actuator:<input>', 'sensor:<output>', 'process:<direction>' or 'state'."
-    )
+        f"{name!r}: a fault is named 'actuator:<input>', 'sensor:<output>', 'process:<direction>' or 'state'.")
 
 
 def channel_of(names: tuple[str, ...], name: str) -> int:
@@ -80,18 +78,10 @@ def functions_of(model: "HammersteinSS", name: str) -> list[int]:
 
 
 def matrices_of(label: str, word: str, given: Any, samples: range, healthy: Array, count: int) -> Array:
-    """Return the matrices A(k) or B(k) of a schedule at some samples, (samples, ...).
+    """Return the matrices A(k) or B(k) (`word`) of a schedule at some samples, (samples, ...).
 
-    Args:
-        label: of the fault, for messages.
-        word: "A" or "B".
-        given: one matrix, one for each of `count` samples, or a function of k; None for the healthy one.
-        samples: those returned.
-        healthy: the matrix of the model.
-        count: samples of the record.
-
-    Raises:
-        StructureError: matrices of another shape, or not finite.
+    Given are one matrix, one for each of the `count` samples of the record, a function of k, or None for the healthy
+    one. Matrices of another shape, or not finite, are a `StructureError` that names the label of the fault.
     """
     values = healthy if given is None else given
     values = np.array([values(k) for k in samples]) if callable(values) else np.asarray(values, dtype=float)
@@ -100,8 +90,7 @@ def matrices_of(label: str, word: str, given: Any, samples: range, healthy: Arra
     if values.shape not in (healthy.shape, (len(samples), *healthy.shape)):
         raise StructureError(
             f"{label}: {word} has shape {values.shape}; it must be {healthy.shape}, or {(count, *healthy.shape)} "
-            "with one matrix for each sample."
-        )
+            "with one matrix for each sample.")
     if not np.isfinite(values).all():
         raise StructureError(f"{label}: {word} has a value that is not finite.")
     return np.broadcast_to(values, (len(samples), *healthy.shape))

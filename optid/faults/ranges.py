@@ -57,8 +57,7 @@ class Outside(NamedTuple):
         low, high = self.interval
         return (
             f"{self.name} is {'far ' * self.is_linear}outside the identified range [{low:.4g}, {high:.4g}] in "
-            f"{self.samples.size} samples, first in sample {self.samples[0]}: its effect there is not judged."
-        )
+            f"{self.samples.size} samples, first in sample {self.samples[0]}: its effect there is not judged.")
 
 
 def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
@@ -170,14 +169,9 @@ def unknown_effects(model: "HammersteinSS", u: Array) -> tuple[Array, Array]:
     if total > min(MOST, count // 2):
         raise DataError(
             f"{' '.join(map(str, there))} This part is too long to be left out: identify the "
-            "model over the wider range, or cut the record."
-        )
+            "model over the wider range, or cut the record.")
     into_state, into_output = np.zeros((count, model.nx, total)), np.zeros((count, model.l, total))
-    k = 0
-    for one in there:
-        for sample in one.samples:
-            if sample + 1 < count:
-                into_state[sample + 1, :, k] = model.B[:, one.column]
-            into_output[sample, :, k] = model.D[:, one.column]
-            k += 1
+    for k, (sample, column) in enumerate((sample, one.column) for one in there for sample in one.samples):
+        into_state[sample + 1 : sample + 2, :, k] = model.B[:, column]
+        into_output[sample, :, k] = model.D[:, column]
     return into_state, into_output

@@ -1,7 +1,7 @@
 """One check of readings before any search: frozen, saturated and dead sensors, on a stream or on a record."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -172,10 +172,7 @@ def lost_readings(y: Array, outputs: Sequence[str], experiment: int = 0) -> tupl
             lines.append(LostReadings(f"sensor:{outputs[o]}", "frozen", experiment, first, repeats.size + 1,
                                       float(y[first, o])))
     limits = {(one.name, one.value) for one in lines if one.condition == "saturated"}
-    conditions = ["saturated" if (one.name, one.value) in limits else one.condition for one in lines]
-    lines = [LostReadings(one.name, condition, experiment, one.first, one.count, one.value)
-             for one, condition in zip(lines, conditions)]
-    return tuple(one for one in lines
+    return tuple(replace(one, condition="saturated") if (one.name, one.value) in limits else one for one in lines
                  if not one.is_dead or one.count > USUAL * _longest_other_gap(y, outputs, one))
 
 

@@ -59,30 +59,22 @@ def check_channels(model: "HammersteinSS", data: Data) -> None:
         if trial < BETTER * energy and trial < 2 * readings:
             raise DataError(
                 f"Input {name!r} seems to be in another unit: the record fits the model when it is divided by "
-                f"{factor:g}. Convert it."
-            )
+                f"{factor:g}. Convert it.")
     for (number, part), (o, name) in product(enumerate(raw.experiments), enumerate(data.outputs)):
         found = _unit_jump(model, Data(part.u, part.y, raw.dt, raw.inputs, raw.outputs), o)
         if found is not None:
             where = f"experiment {number + 1}: " * (raw.n_experiments > 1)
             raise DataError(
                 f"{where}the unit of output {name!r} seems to change at sample {found[0]}: from there on the readings "
-                f"fit the model when divided by {found[1]:g}. Convert them."
-            )
+                f"fit the model when divided by {found[1]:g}. Convert them.")
 
 
 def check_causality(model: "HammersteinSS", data: Data) -> None:
     """Refuse a model of the inverse of a controller.
 
     Where an input is the answer of a controller and nothing else, a model in which it acts on the outputs at once
-    explains the record best as the inverse of the controller, and knows nothing about the plant.
-
-    Args:
-        model: the model.
-        data: the record it was identified from.
-
-    Raises:
-        DataError: such an input acts at once.
+    explains the record that it was identified from best as the inverse of the controller, and knows nothing about the
+    plant: a `DataError`.
     """
     direct = {model.input_of[column] for column in np.flatnonzero(model.D.any(axis=0))}
     tied = [c for c in direct if outside(RecordSignals.of(data), c) < TIED]
@@ -107,8 +99,7 @@ def _check_order(what: str, names: tuple[str, ...], energy: float, of: Callable[
         moved = [names[i] for i, j in enumerate(orders[best]) if i != j]
         raise DataError(
             f"The {what} {', '.join(moved)} look swapped: in the order {', '.join(names[j] for j in orders[best])} the "
-            f"model predicts the outputs {energy / trials[best]:.0f} times better. Check the names of the columns."
-        )
+            f"model predicts the outputs {energy / trials[best]:.0f} times better. Check the names of the columns.")
 
 
 def _unit_jump(model: "HammersteinSS", alone: Data, o: int) -> tuple[int, float] | None:

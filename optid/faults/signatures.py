@@ -334,8 +334,7 @@ def _seen(steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> 
     trace = response(steady, candidate, _horizon(steady))
     possible = np.linalg.norm(steady.root) * (
         np.linalg.norm(candidate.into_state, axis=0) * max(np.linalg.norm(steady.C), 1e-300)
-        + np.linalg.norm(candidate.into_output, axis=0)
-    )
+        + np.linalg.norm(candidate.into_output, axis=0))
     _, sizes, axes = np.linalg.svd(trace.reshape(-1, trace.shape[2]), full_matrices=False)
     there = sizes > UNSEEN * max(float(possible.max(initial=0.0)), 1e-300)
     if not there.any():

@@ -57,11 +57,7 @@ class Predictor:
     ) -> Array:
         """Return the response (N, l, d) of the innovations to additions to x(k) (N, n, d) and to y(k) (N, l, d).
 
-        Args:
-            into_state: (N, n, d).
-            into_output: (N, l, d).
-            present: (N, l) whether there is a reading; all by default.
-            A: (N, n, n) of a plant that changes; that of the model by default.
+        All readings are `present` (N, l) by default, and the plant does not change; else it has A (N, n, n).
         """
         if A is None and len(into_output) <= SHORT and (present is None or present.all()):
             drive = into_state.copy()
@@ -117,8 +113,7 @@ def predictor(model: "HammersteinSS") -> Predictor:
     if model.noise is None:
         raise StructureError(
             "The model has no noise covariances, which give the scale of its innovations: estimate them with "
-            "optid.noise.with_noise(model, data)."
-        )
+            "optid.noise.with_noise(model, data).")
     noise, failure = model.noise, ""
     for added in (0.0, ADDED):
         try:
@@ -192,24 +187,16 @@ class Whitened:
 def check_window(
     model: "HammersteinSS", whitened: Whitened, what: str, onset: int = 0, longest: float = np.inf
 ) -> None:
-    """Refuse whitened innovations that a search or a test cannot take.
-
-    Args:
-        model: of the innovations.
-        whitened: the window.
-        what: the search or the test, for messages.
-        onset: sample of the window at which a change is assumed.
-        longest: largest number of readings of a window.
+    """Refuse whitened innovations that a search or a test (`what`) of at most `longest` readings cannot take.
 
     Raises:
-        StructureError: several experiments, an onset outside the window, a window that is too long.
+        StructureError: several experiments, an onset of a change outside the window, a window that is too long.
         DataError: other outputs than the model's, innovations that are not finite.
     """
     if not isinstance(whitened, Whitened):
         raise StructureError(
             f"{what} takes the whitened innovations of one experiment, as returned by optid.faults.whiten: pass the "
-            "experiments of a record one by one."
-        )
+            "experiments of a record one by one.")
     count, outputs = whitened.r.shape
     if outputs != model.l:
         raise DataError(f"The window has {outputs} outputs; the dictionary is of {model.l}.")
@@ -293,8 +280,7 @@ class Health:
         return (
             f"innovations over {self.samples} samples: p-value of whiteness {p_value(self.p_value, 3)} "
             f"({self.lags} lags)\n"
-            f"size over the predicted one: {sizes}; largest {self.ratio:.3f}"
-        )
+            f"size over the predicted one: {sizes}; largest {self.ratio:.3f}")
 
     def predictor(self, steady: Predictor, *, rescale: bool = False) -> Predictor:
         """Return the predictor to use for thresholds.
@@ -313,8 +299,7 @@ class Health:
             raise DataError(
                 f"The innovations of the healthy record are not white (p-value {p_value(self.p_value)}): thresholds "
                 "from this model would be wrong. Fit the model again, include the uncertainty of the identified "
-                "model (model_uncertainty), or watch with Monitor(..., healthy=record), which takes the noise from it."
-            )
+                "model (model_uncertainty), or watch with Monitor(..., healthy=record), which takes the noise from it.")
         if rescale:
             covariance = np.linalg.solve(steady.root, np.linalg.solve(steady.root, self.covariance).T)
             covariance = (covariance + covariance.T) / 2
@@ -323,8 +308,7 @@ class Health:
             raise DataError(
                 f"The innovations of the healthy record are {self.ratio:.2f} times as large as the model predicts "
                 f"({', '.join(f'{name} {ratio:.2f}' for name, ratio in self.ratios.items())}): the scale of the noise "
-                "is wrong. Pass rescale=True to take it from this record, or estimate the noise again."
-            )
+                "is wrong. Pass rescale=True to take it from this record, or estimate the noise again.")
         if self.ratio < 1 / OTHER_SCALE:
             warnings.warn(
                 f"The innovations are only {self.ratio:.2f} times as large as the model predicts: small faults will be "

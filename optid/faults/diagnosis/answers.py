@@ -338,5 +338,4 @@ def _built(kind: Any, value: Any) -> Any:
         value = {**value, "candidate": {"name": value["name"], "kind": value["kind"], **value["candidate"]}}
     return kind(**{
         part.name: _built(part.type, value[part.name]) for part in fields(kind)
-        if part.name in value or part.default is part.default_factory is MISSING
-    })
+        if part.name in value or part.default is part.default_factory is MISSING})

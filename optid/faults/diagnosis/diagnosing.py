@@ -100,8 +100,7 @@ def _dictionary(model: "HammersteinSS", faults: Dictionary | None) -> Dictionary
         return dictionary(model, kinds=KINDS)
     if not isinstance(faults, Dictionary):
         raise StructureError(
-            f"faults is a {type(faults).__name__}: pass the dictionary of optid.faults.dictionary(model, kinds=[...])."
-        )
+            f"faults is a {type(faults).__name__}: pass the dictionary of optid.faults.dictionary(model, kinds=[...]).")
     if not faults.belongs_to(model):
         raise StructureError("The dictionary is of another model: build it with optid.faults.dictionary(model, ...).")
     return faults

@@ -89,12 +89,7 @@ class Explanation(NamedTuple):
 
 
 def marginal(energies: Array, dimension: int | np.ndarray) -> Array:
-    """Return the marginal log-likelihood ratio to the healthy plant.
-
-    Args:
-        energies: energy explained, any shape.
-        dimension: number of magnitudes, one or as many as energies.
-    """
+    """Return the marginal log-likelihood ratio to the healthy plant of energies explained by so many magnitudes."""
     from scipy.special import logsumexp
 
     g = np.array(SPREADS)
@@ -127,13 +122,10 @@ def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int]
         ranges.append(there[~np.isnan(row[there])])
     blocks = [
         np.stack([scan.signature(c, int(k)).reshape(scan.whitened.r.size, -1) for k in there])
-        for c, there in zip(candidates, ranges)
-    ]
-    dims = [block.shape[2] for block in blocks]
-    edges = np.cumsum([0, *dims])
-    axes = np.meshgrid(*[np.arange(len(there)) for there in ranges], indexing="ij")
-    rows = [axis.ravel() for axis in axes]
-    count, total = rows[0].size, int(edges[-1])
+        for c, there in zip(candidates, ranges)]
+    edges = np.cumsum([0, *(block.shape[2] for block in blocks)])
+    rows = np.indices([len(there) for there in ranges]).reshape(len(ranges), -1)
+    count, total = rows.shape[1], int(edges[-1])
     gram, correlation = np.empty((count, total, total)), np.empty((count, total))
     r = scan.whitened.r.ravel()
     for i, first in enumerate(blocks):
@@ -170,8 +162,7 @@ def least_squares(gram: Array, correlation: Array, floor: float = 1e-6) -> tuple
 
 def bounded_shares(candidates: Sequence[Candidate], sizes: Array, covariances: Array) -> Array:
     """Return the change (K,) of the log-likelihood because a share lost lies between 0 and 1."""
-    change = np.zeros(len(sizes))
-    first = 0
+    change, first = np.zeros(len(sizes)), 0
     for candidate in candidates:
         if candidate.fault_kind.loses:
             change += np.log(share_bound(sizes[:, first], covariances[:, first, first]))
@@ -207,8 +198,7 @@ def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tu
 
     For onsets within `edge` samples of the start or end of the window, of N samples, the size is NaN.
     """
-    weights, best, first = found.weights, found.best, 0
-    result = []
+    weights, best, first, result = found.weights, found.best, 0, []
     for number, candidate in enumerate(found.candidates):
         part = slice(first, first + candidate.dimension)
         first = part.stop
@@ -247,11 +237,7 @@ def onset_range(onsets: np.ndarray, weights: Array, coverage: float, best: int) 
 def mixture_intervals(weights: Array, means: Array, stds: Array, coverage: float) -> Array:
     """Return the central intervals (d, 2) of mixtures of K normal laws, by bisection.
 
-    Args:
-        weights: (K,) of the components.
-        means: (K, d) of the components.
-        stds: (K, d) of the components; not positive where nothing is known.
-        coverage: probability of each interval.
+    The components have weights (K,), means (K, d) and stds (K, d), which are not positive where nothing is known.
     """
     from scipy.special import ndtr
 

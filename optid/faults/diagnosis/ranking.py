@@ -218,8 +218,7 @@ def _by_programme(seen: RecordSearch) -> Ranking:
     asked, search, limits = seen.asked, seen.search, seen.limits
     if search is None or limits is None:
         raise StructureError(
-            f"method={asked.method!r} requires a candidate with a signature: add kind 'bias', or use method='exact'."
-        )
+            f"method={asked.method!r} requires a candidate with a signature: add kind 'bias', or use method='exact'.")
     try:
         result: SparseResult = solve_registered("fault.signature", search, limits, solver=asked.solver)
     except SolverFailed:

@@ -55,8 +55,7 @@ class Question:
         check_integer(self.max_faults, "max_faults")
         if self.method == "exact" and self.max_faults > 2:
             raise StructureError(
-                f"max_faults={self.max_faults}: the exact search is limited to two faults. Use method='sparse+polish'."
-            )
+                f"max_faults={self.max_faults}: the exact search is limited to two faults. Use method='sparse+polish'.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +146,7 @@ def search_record(
         if seen < least:
             raise DataError(
                 f"The record has {seen} samples with a reading (repeated readings of flat lines do not count): "
-                f"{found.model.nx} states require {least}."
-            )
+                f"{found.model.nx} states require {least}.")
         return white
 
     given, outliers = part, ()
@@ -175,8 +173,7 @@ def _limits(found: Dictionary, white: Whitened, u: Array, asked: Question) -> Th
         if given.window != count:
             raise StructureError(
                 f"The thresholds are for windows of {given.window} samples; the record has {count}. Calibrate them "
-                f"with thresholds(faults, {count}, ...), or leave them out."
-            )
+                f"with thresholds(faults, {count}, ...), or leave them out.")
         return given
     rate = asked.false_alarm * (1 - UNKNOWN_SHARE * found.unknown - COURSE_SHARE * any(without_signature(found)))
     needed = int(np.ceil(EXCEEDING / rate))
@@ -184,8 +181,7 @@ def _limits(found: Dictionary, white: Whitened, u: Array, asked: Question) -> Th
         raise DataError(
             f"false_alarm={asked.false_alarm:g}: thresholds for so rare an alarm need {needed} simulated windows; "
             f"{MOST_DRAWS} are the most ({EXCEEDING / MOST_DRAWS:g} is the rarest alarm). Ask for a higher "
-            "probability, or simulate them yourself: thresholds(..., draws=...)."
-        )
+            "probability, or simulate them yourself: thresholds(..., draws=...).")
     draws = max(needed, min(DRAWS, SIMULATED // count))
     inputs = u if any(c.columns or c.schedule is not None for c in found.candidates) else None
     return thresholds(found, white, rate, u=inputs, draws=draws, seed=asked.seed)
@@ -211,8 +207,7 @@ def untestable(found: Scan) -> dict[str, str]:
                 value = float(np.linalg.eigvalsh(flat.T @ flat)[0])
                 result[candidate.label] = (
                     f"no excitation: a complete loss would have a deflection of {deflection:.2g} beside a constant "
-                    f"offset, {LEAST:g} is required (smallest Gram eigenvalue {max(value, 0.0):.2g})"
-                )
+                    f"offset, {LEAST:g} is required (smallest Gram eigenvalue {max(value, 0.0):.2g})")
         elif (candidate.additive or candidate.columns) and np.isnan(found.statistic[c]).all():
             result[candidate.label] = "it has no effect in this record"
     return result

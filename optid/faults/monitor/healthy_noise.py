@@ -49,8 +49,7 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
             shape = Predictor(steady.A[n:, n:], steady.C[:, n:], np.zeros((len(steady.A) - n, l)), steady.K[n:],
                               steady.covariance, steady.root)
             raw_effect = shape.respond(np.zeros((len(here.y), len(shape.A), raw_effect.shape[2])), raw_effect)
-        effect = raw_effect
-        effects.append(steady.root @ effect)
+        effects.append(steady.root @ raw_effect)
         inputs.append(known.model.expand_inputs(here.u))
     effect = np.concatenate(effects)
     if not known.deviation:
@@ -123,10 +122,8 @@ def without_drift(found: Dictionary, samples: float) -> Dictionary:
 
     The innovations e of the model count as a line that changes slowly, s+ = s + v + a w, v+ = v + b w, and a white rest
     w = e - s. Both poles of the filter are 1 - 1 / (`FOLLOWED` samples): a hundredth, (2 pi `FOLLOWED`)^2, is left of a
-    period of so many samples, and a constant fault is forgotten with the same poles.
-
-    Raises:
-        StructureError: fewer than `SLOWEST` samples.
+    period of so many samples, and a constant fault is forgotten with the same poles. Fewer than `SLOWEST` samples are a
+    `StructureError`.
     """
     if not samples >= SLOWEST:
         raise StructureError(f"drift={samples!r}: slow disturbances must take {SLOWEST} samples at least.")

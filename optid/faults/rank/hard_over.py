@@ -16,7 +16,7 @@ one window later. Open loop is assumed: under feedback inputs depend on sensor n
 
 from dataclasses import dataclass, field, replace
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from optid.arrays import Array, check_integer, check_probability, one_of
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.order.ranks import RankTest, lagged_covariances, moments_of_sum, rank_test
+from optid.identify.order.ranks import RankTest, lagged_covariances, moments_of_sum, quantile_of_sum, rank_test
+from optid.phrases import short
 from optid.statistics.hankel import HankelStatistics, RegressionRows, hankel_statistics
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ class ChannelRegression(NamedTuple):
 class ZeroTest:
     """Test of one group of coefficients on one window."""
 
-    name: str  # the channel, for instance "sensor:y1"
+    name: str  # the channel
     statistic: float = float("nan")  # T, without unit; NaN where the window has too few samples
     threshold: float = float("nan")  # quantile of T if the coefficients are zero
     p_value: float = float("nan")  # probability of a larger T if they are zero
@@ -180,8 +181,7 @@ class HardOver:
 
     def __str__(self) -> str:
         """Print the first four channels of every window, and what was found."""
-        names = [test.name for test in self.windows[0].tests[:4]]
-        shown = "".join(f"{name if len(name) <= 13 else name[:12] + '.':>14}" for name in names)
+        shown = "".join(f"{short(test.name, 13):>14}" for test in self.windows[0].tests[:4])
         lines = ["statistic / threshold of each channel; up to 1 is dead, - is untestable",
                  f"{'samples':<15}{'order':>6}{shown}"]
         for verdict in self.windows:
@@ -250,10 +250,9 @@ class _Tests:
             raise DataError(f"the model has channels {', '.join((*model.inputs, *model.outputs))}, the record others.")
         self.model, self.alpha, self.level = model, alpha, level
         self.input_of = range(healthy.m) if model is None else model.input_of
-        places: list[Any] = np.split(np.arange(len(self.input_of) + healthy.l), [len(self.input_of)])
-        self.u, self.y = places
-        self.sensors, self.actuators = ([f"{place}:{c}" for c in names] for place, names in
-                                        (("sensor", healthy.outputs), ("actuator", healthy.inputs)))
+        self.u, self.y = np.arange(len(self.input_of)), len(self.input_of) + np.arange(healthy.l)
+        self.sensors = [f"sensor:{c}" for c in healthy.outputs]
+        self.actuators = [f"actuator:{c}" for c in healthy.inputs]
         statistics = hankel_statistics(self.signals(healthy), 3 * alpha, centre="mean")
         statistics.check()
         at, past, future = statistics.at, range(alpha), range(alpha, 2 * alpha)
@@ -261,8 +260,8 @@ class _Tests:
         self.regression = RegressionRows(
             np.r_[0, self.inputs, at(self.y if instruments == "inputs+past" else [], past)],
             np.r_[0, at(self.u, future)], at(self.y, future))
-        mean = statistics.gram[0] / statistics.windows
-        self.sizes = np.sqrt(np.maximum(np.diag(statistics.gram) / statistics.windows - mean**2, 0))
+        moments = statistics.gram / statistics.windows
+        self.sizes = np.sqrt(np.maximum(np.diag(moments) - moments[0]**2, 0))
         for channel, size in zip((*(healthy.inputs[i] for i in self.input_of), *healthy.outputs), self.sizes[1:]):
             if not size > 0:
                 raise RankError(f"{channel} is constant in the healthy record: use one in which every channel varies.")
@@ -272,21 +271,19 @@ class _Tests:
                             f"eigenvalue {self.excited:.1e}): use richer inputs or fewer block rows.")
         self.order = self.rank(statistics, LEVEL).order if order is None else order
         self.outputs, self.healthy = coefficients(statistics, self.regression), dict[str, Array]()
-        rows, columns, _ = self.channel_tests(statistics)
-        self.healthy = {test.name: test.coefficients for test in (*rows, *columns)}
+        self.healthy = {test.name: test.coefficients for tests in self.channel_tests(statistics)[:2] for test in tests}
 
     def signals(self, data: Data) -> list[Array]:
-        return [np.hstack([e.u if self.model is None else self.model.expand_inputs(e.u),
-                           e.y]) for e in data.experiments]
+        return [np.hstack([e.u if self.model is None else self.model.expand_inputs(e.u), e.y])
+                for e in data.experiments]
 
     def judge(self, record: Array, place: tuple[int, int, int]) -> WindowVerdict:
         try:
             statistics = hankel_statistics([record], 3 * self.alpha, centre="mean", method="gram")
             statistics.check()
         except RankError as error:
-            rows, columns = (tuple(ZeroTest(name, healthy=0.0) for name in names)
-                             for names in (self.sensors, self.actuators))
-            return WindowVerdict(*place, None, str(error), float("nan"), rows, columns)
+            tests = (tuple(ZeroTest(name, healthy=0.0) for name in names) for names in (self.sensors, self.actuators))
+            return WindowVerdict(*place, None, str(error), float("nan"), *tests)
         excitation = self.excitation(statistics) / self.excited
         order, least = None, 0
         note = f"untestable: smallest eigenvalue of the inputs {excitation:.1e} of the healthy one"
@@ -303,9 +300,8 @@ class _Tests:
 
     def excitation(self, statistics: HankelStatistics) -> float:
         """Smallest eigenvalue of the covariance of the inputs, in units of their healthy sizes."""
-        at = self.inputs
-        mean = statistics.gram[0, at] / statistics.windows
-        covariance = statistics.gram[np.ix_(at, at)] / statistics.windows - np.outer(mean, mean)
+        at, moments = self.inputs, statistics.gram / statistics.windows
+        covariance = moments[np.ix_(at, at)] - np.outer(moments[0, at], moments[0, at])
         return max(float(np.linalg.eigvalsh(covariance / np.outer(self.sizes[at], self.sizes[at]))[0]), 0.0)
 
     def rank(self, statistics: HankelStatistics, level: float) -> RankTest:
@@ -348,8 +344,6 @@ def zero_test(
     t and o lie within the first `rows` block rows. The scale (y,) is that of the healthy outputs, and `healthy` (t, y)
     are the coefficients of a healthy record.
     """
-    from scipy.special import chdtrc, chdtri
-
     _, t, o, y = regression
     j, width = statistics.windows, 1 + rows * statistics.d
     gram = statistics.gram[:width, :width] / j
@@ -383,8 +377,8 @@ def zero_test(
         found = replace(found, healthy=mean / j + float(np.sum(gained**2)))
     if mean <= 0 or variance <= 0:  # residuals are rounding: any coefficient counts
         return replace(found, threshold=0.0, p_value=float(found.statistic == 0))
-    g, h = variance / (2 * mean), 2 * mean**2 / variance
-    return replace(found, threshold=float(g / j * chdtri(h, level)), p_value=float(chdtrc(h, found.statistic * j / g)))
+    quantile, p_value = quantile_of_sum(mean, variance, level, found.statistic * j)
+    return replace(found, threshold=quantile / j, p_value=p_value)
 
 
 def coefficients(statistics: HankelStatistics, regression: RegressionRows) -> Array:

@@ -73,9 +73,8 @@ class Scan:
             LookupFailed: no such candidate.
         """
         c = self.dictionary[candidate] if isinstance(candidate, str) else candidate
-        for i, other in enumerate(self.dictionary.candidates):
-            if other is c:
-                return i
+        if here := [i for i, other in enumerate(self.dictionary.candidates) if other is c]:
+            return here[0]
         raise LookupFailed(f"{c.label!r} is not in the dictionary. {nearest(c.label, self.labels)}")
 
     def peak(self, candidate: Candidate | str) -> int:

@@ -86,19 +86,12 @@ class SparseResult:
     @property
     def clusters(self) -> tuple[tuple[int, int], ...]:
         """First and last onset of every run of active onsets not more than twice `REACH` apart."""
-        onsets = self.onsets
-        if not onsets.size:
-            return ()
-        cuts = np.flatnonzero(np.diff(onsets) > 2 * REACH)
-        firsts, lasts = onsets[np.concatenate([[0], cuts + 1])], onsets[np.concatenate([cuts, [onsets.size - 1]])]
-        return tuple((int(a), int(b)) for a, b in zip(firsts, lasts))
+        runs = np.split(self.onsets, np.flatnonzero(np.diff(self.onsets) > 2 * REACH) + 1)
+        return tuple((int(run[0]), int(run[-1])) for run in runs if run.size)
 
     def near(self, reach: int = REACH) -> np.ndarray:
         """Return the mask (N,) of the onsets within reach of an active one."""
-        mask = np.zeros(self.count, dtype=bool)
-        for onset in self.onsets:
-            mask[max(onset - reach, 0) : onset + reach + 1] = True
-        return mask
+        return np.any(np.abs(np.arange(self.count)[:, None] - self.onsets) <= reach, axis=1)
 
     @classmethod
     def of(cls, stated: "Problem", solution: "Solution", atoms: Sequence[Atoms], count: int) -> "SparseResult":

@@ -137,10 +137,8 @@ def best_subsets(
     if near is not None and not near.all():
         for gain, members in best.ranked[:EXCHANGED]:
             best.offer(*exchange_search(members, gain, columns.best_beside))
-    ranked = []
-    for gain, members in best.ranked:
-        names, onsets = zip(*((scan.labels[c], k) for c, k in members))
-        ranked.append(Subset(names, onsets, gain, gain + float(sum(q[c] for c, _ in members))))
+    ranked = [Subset(tuple(scan.labels[c] for c, _ in members), tuple(k for _, k in members), gain,
+                     gain + float(sum(q[c] for c, _ in members))) for gain, members in best.ranked]
     searched = np.asarray(tested.any(axis=0)) if near is None else near
     return SubsetSearch(scan, tuple(ranked), searched, subsets, alike)
 

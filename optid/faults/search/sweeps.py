@@ -183,15 +183,13 @@ def sweep(found: Dictionary, window: int | Whitened, u: Any = None) -> Sweep:
     states = None if inputs is None else white.states
     able = tuple(
         c.additive or bool(c.columns) and inputs is not None or c.schedule is not None and states is not None
-        for c in found.candidates
-    )
+        for c in found.candidates)
     if states is not None and len(states) != count and any(c.schedule for c in found.candidates):
         raise DataError(f"The states have {len(states)} samples; the window has {count}: cut them like the rest.")
     if not any(able):
         raise StructureError(
             "No candidate has a signature: add the kind 'bias', 'drift' or a state jump, or pass the input u for "
-            "losses and stuck actuators."
-        )
+            "losses and stuck actuators.")
     driven = any(a and not c.additive for c, a in zip(found.candidates, able))
     if driven or white.nuisance is not None or not white.present.all():
         return _prepared(found, white, inputs, able)
@@ -213,8 +211,7 @@ def _inputs(found: Dictionary, u: Any, window: int) -> Array:
     if bad.any():
         k, c = np.argwhere(bad)[0]
         raise DataError(
-            f"Input {found.model.inputs[c]!r} is missing at sample {k}: the signature of a loss requires every input."
-        )
+            f"Input {found.model.inputs[c]!r} is missing at sample {k}: the signature of a loss requires every input.")
     return inputs
 
 
@@ -277,8 +274,7 @@ def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[boo
     line = lasting + drifts + drifts + jumps  # the helpers of the drifts are the last of the columns that last
     into = [
         found.additions(c, window, 0, u) if c.columns else (c.into_state[None], c.into_output[None])
-        for c in (candidates[i] for i in line)
-    ]
+        for c in (candidates[i] for i in line)]
     if not all(candidates[i].additive for i in line):
         into = [tuple(np.broadcast_to(part, (window, *part.shape[1:])) for part in pair) for pair in into]
         gains, whitening, of = gains[of], whitening[of], np.arange(window)
