@@ -17,8 +17,7 @@ from optid.faults.diagnosis.outliers import cleaned, with_spikes
 from optid.faults.diagnosis.posterior import Explanation
 from optid.faults.diagnosis.sensor_gains import sensor_gains
 from optid.faults.false_alarms import EXCEEDING, Thresholds
-from optid.faults.search.calibration import thresholds
-from optid.faults.search.scanning import Scan, scan
+from optid.faults.search.scanning import Scan, scan, thresholds
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, whiten
 
