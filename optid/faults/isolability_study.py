@@ -213,7 +213,7 @@ def _curves(
         own = excess[:, [place]]
         preferred[:, g] = np.mean((own > 0) & (own >= excess), axis=0)
         preferred[place, g] = detected[g]
-        accused[:, g] = [np.mean(alarm & (answer == j)) for j in range(count)]
+        accused[:, g] = np.bincount(answer[alarm], minlength=count) / draws
     return detected, isolated, preferred, accused, unit
 
 

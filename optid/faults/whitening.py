@@ -2,12 +2,12 @@
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optid.arrays import Array, as_list, compact, one_or_all
-from optid.data.record import Data, Experiment
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
@@ -151,19 +151,6 @@ class Nuisance:
         return np.asarray((flat - self.U @ (drop[:, None] * (self.U.T @ flat))).reshape(r.shape))
 
 
-class UncertainInnovations(Protocol):
-    """What whitening asks of the uncertainty of an identified model: a predictor, and its effect on a window."""
-
-    @property
-    def predictor(self) -> Predictor:
-        """The predictor of its noise."""
-        ...
-
-    def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
-        """Return the effect on the innovations of an experiment with readings (N, l) from a state (n,)."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Whitened:
     """Whitened innovations of one record."""
@@ -211,7 +198,7 @@ def check_window(
 
 
 def whiten(
-    model: "HammersteinSS", data: Data, *, x0: Any = "fit", uncertainty: UncertainInnovations | None = None,
+    model: "HammersteinSS", data: Data, *, x0: Any = "fit", uncertainty: Any = None,
     scale: Predictor | None = None,
 ) -> Any:
     """Return the whitened innovations of a record; a tuple for several experiments.

@@ -16,8 +16,7 @@ from optid.errors import DataError, DataWarning, ModelFileError, StructureError
 from optid.faults import Fault, Monitor, diagnose, dictionary, inject, whiten
 from optid.models import Nonlinearity
 
-HIGH = 1e9
-"""A threshold that nothing exceeds."""
+HIGH = 1e9  # a threshold that nothing exceeds
 
 
 def plant(feedback=False):

@@ -132,11 +132,6 @@ class Certificate:
         """Whether there is evidence."""
         return self.basis != "none"
 
-    @property
-    def excludes_health(self) -> bool:
-        """Whether it proves that no healthy plant made the record."""
-        return self.parity_vector is not None
-
 
 @dataclass(frozen=True, eq=False)
 class Remaining:

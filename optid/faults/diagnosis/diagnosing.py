@@ -126,7 +126,7 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
         notes.append("With one output only faults with a known course are isolable.")
     timeline = record.timelines[number]
     answers = _answers(seen, fits, stuck, timeline)
-    certificate = ranking.certificate if fits or ranking.certificate.excludes_health else NOTHING
+    certificate = ranking.certificate if fits or ranking.certificate.parity_vector is not None else NOTHING
     if stuck and not fits:
         certificate = Certificate("flat line", float(max(line.count for line in lines)))
     remaining = None

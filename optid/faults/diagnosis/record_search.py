@@ -12,7 +12,7 @@ from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError, nearest
 from optid.faults.diagnosis.alternatives import with_unlisted_candidates
 from optid.faults.diagnosis.courses import courses, without_signature
-from optid.faults.diagnosis.leftover import alarm_probability, remainder_test
+from optid.faults.diagnosis.leftover import further_fault, remainder_test
 from optid.faults.diagnosis.outliers import cleaned, with_spikes
 from optid.faults.diagnosis.posterior import Explanation
 from optid.faults.diagnosis.sensor_gains import sensor_gains
@@ -90,9 +90,9 @@ class RecordSearch:
     def p_value(self) -> float:
         """p-value of the healthy plant; there is an alarm at or below the false-alarm probability."""
         values = [1.0]
-        if self.limits is not None and not np.isnan(self.gains).all():
+        if self.limits is not None:
             rate = self.limits.false_alarm
-            values.append(alarm_probability(float(np.nanmax(self.gains)), rate) * self.asked.false_alarm / rate)
+            values.append(further_fault(self.gains, rate) * self.asked.false_alarm / rate)
         if self.dictionary.unknown:
             values.append(self.healthy.p_value / UNKNOWN_SHARE)
         if self.courses:

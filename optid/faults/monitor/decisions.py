@@ -73,11 +73,6 @@ class Decisions:
         """(C,) energies at which the search must stop for a decision."""
         return self.limits.thresholds if self.phase == WATCHING else np.zeros(len(self.labels))
 
-    @property
-    def waiting(self) -> bool:
-        """Whether the next samples can be searched as a block."""
-        return self.phase == WATCHING and not self.passing
-
     def count_quiet(self, statistic: Array) -> None:
         """Count the samples at the end of a block with all statistics (T, C) below the release level."""
         loud = np.flatnonzero(np.any(statistic > self.rules["release"] * self.limits.thresholds, axis=1))

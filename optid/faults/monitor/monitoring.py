@@ -230,7 +230,7 @@ class Monitor:
             if self.recent is not None:
                 due = self.recent.next_final(decisions.onsets, self.samples)
                 clean = int(min(clean, k + due - self.samples))
-            if clean > k and self.plant.certain and decisions.waiting:
+            if clean > k and self.plant.certain and decisions.phase == WATCHING and not decisions.passing:
                 k += self._search_block(f[k:clean], fed[k:clean], y[k:clean], events)
             else:
                 if k in screened.frozen:

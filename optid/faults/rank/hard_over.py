@@ -15,8 +15,9 @@ one window later. Open loop is assumed: under feedback inputs depend on sensor n
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from textwrap import wrap
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +26,9 @@ from optid.arrays import Array, check_integer, check_probability, one_of
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.identify.order.ranks import RankTest, lagged_covariances, moments_of_sum, quantile_of_sum, rank_test
+from optid.models import HammersteinSS
 from optid.phrases import short
 from optid.statistics.hankel import HankelStatistics, RegressionRows, hankel_statistics
-
-if TYPE_CHECKING:
-    from optid.models.hammerstein_ss import HammersteinSS
 
 BLOCK_ROWS = 6
 LONG = 20  # windows have at least this many samples per future row of outputs
@@ -192,7 +191,7 @@ class HardOver:
 
 
 def hard_over_test(
-    data: Data, healthy: Data, *, model: "HammersteinSS | None" = None, order: int | None = None,
+    data: Data, healthy: Data, *, model: HammersteinSS | None = None, order: int | None = None,
     window: int | None = None, hop: int | None = None, block_rows: int = BLOCK_ROWS, instruments: str = "inputs",
     level: float = LEVEL, white_sensors: bool = True,
 ) -> HardOver:
@@ -242,7 +241,7 @@ def hard_over_test(
 class _Tests:
     """The tests of windows of 3 alpha samples of the signals [f(u) | y], compared with a healthy record."""
 
-    def __init__(self, healthy: Data, model: "HammersteinSS | None", alpha: int, instruments: str, level: float,
+    def __init__(self, healthy: Data, model: HammersteinSS | None, alpha: int, instruments: str, level: float,
                  order: int | None) -> None:
         if model is not None and model.feedback:
             raise StructureError("The model feeds outputs back: this test is for plants in open loop.")
@@ -313,15 +312,11 @@ class _Tests:
         """Row tests, column tests, and the sensors whose output is autocorrelated."""
         alpha, at, rows, columns, moving = self.alpha, statistics.at, [], [], set()
         past, future, now, until = range(alpha), range(alpha, 2 * alpha), [alpha], range(alpha + 1)
-
-        def test(regression: ChannelRegression, healthy: Array | None) -> ZeroTest:
-            return zero_test(statistics, regression, rows=2 * alpha, level=self.level,
-                             scale=self.sizes[regression.outputs], healthy=healthy)
-
+        test = partial(zero_test, statistics, rows=2 * alpha, level=self.level, scale=self.sizes)
         for s, name in zip(self.y, self.sensors):
             rows.append(test(ChannelRegression(name, self.inputs, np.array([0]), at([s], future)),
-                             self.healthy.get(name)))
-            own = test(ChannelRegression(name, at([s], past), np.r_[0, self.inputs], at([s], now)), None)
+                             healthy=self.healthy.get(name)))
+            own = test(ChannelRegression(name, at([s], past), np.r_[0, self.inputs], at([s], now)))
             moving |= {name} if own.statistic > own.threshold else set()
         seen = [i for i, row in enumerate(rows) if not row.flat]  # a constant sensor shows no actuator
         for j, name in enumerate(self.actuators):
@@ -331,7 +326,7 @@ class _Tests:
             mine, healthy = np.equal(self.input_of, j), self.healthy[name][:, seen] if self.healthy else None
             others = np.r_[0, at(self.u[~mine], until), at(self.y, past)]
             regression = ChannelRegression(name, at(self.u[mine], until), others, at(self.y[seen], now))
-            columns.append(test(regression, healthy))
+            columns.append(test(regression, healthy=healthy))
         return tuple(rows), tuple(columns), frozenset(moving)
 
 
@@ -341,8 +336,8 @@ def zero_test(
 ) -> ZeroTest:
     """Test whether the coefficients of y on t are zero, given o, from the moments of windows of `rows` + reach samples.
 
-    t and o lie within the first `rows` block rows. The scale (y,) is that of the healthy outputs, and `healthy` (t, y)
-    are the coefficients of a healthy record.
+    t and o lie within the first `rows` block rows. The scale is that of all healthy signals, and `healthy` (t, y) are
+    the coefficients of a healthy record.
     """
     _, t, o, y = regression
     j, width = statistics.windows, 1 + rows * statistics.d
@@ -355,7 +350,7 @@ def zero_test(
     weights[o] -= past
     left, on_t = weights.T @ gram @ weights, weights[:, : t.size]
     variances = np.diag(left)[t.size :]
-    spread = np.maximum(np.sqrt(np.maximum(variances, 0)) if scale is None else scale, 1e-150)
+    spread = np.maximum(np.sqrt(np.maximum(variances, 0)) if scale is None else scale[y], 1e-150)
     values, vectors = np.linalg.eigh(left[: t.size, : t.size])
     kept = values > DROPPED * t.size
     values, vectors = values[kept], vectors[:, kept]
