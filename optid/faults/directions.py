@@ -9,7 +9,7 @@ plant without d, whatever its course.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,9 +18,7 @@ from optid.arrays import Array
 from optid.errors import LookupFailed, StructureError, nearest
 from optid.faults.places import place_of
 from optid.faults.whitening import Predictor, predictor
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 UNLIMITED = 1e5  # standard deviation of a disturbance, relative to those of the innovations that it affects
 ROUND = 1e-6  # isotropic covariance added to the process noise, relative to its trace
@@ -30,8 +28,8 @@ GENERIC = np.exp(0.7j) * 1.3
 
 
 def decouple(
-    model: "HammersteinSS", disturbances: Sequence[str], process: Mapping[str, ArrayLike] | None = None
-) -> tuple["HammersteinSS", Predictor]:
+    model: HammersteinSS, disturbances: Sequence[str], process: Mapping[str, ArrayLike] | None = None
+) -> tuple[HammersteinSS, Predictor]:
     """Return a model whose noise includes disturbances of any course, and the predictor decoupled from them.
 
     Args:
@@ -77,7 +75,7 @@ def decouple(
     return louder, replace(loud, root=np.ascontiguousarray(r[::-1, ::-1]), silent=silent)
 
 
-def direction_of(model: "HammersteinSS", outputs: Mapping[str, float]) -> Array:
+def direction_of(model: HammersteinSS, outputs: Mapping[str, float]) -> Array:
     """Return the direction (n,) in the state equation that changes the outputs by given amounts within one sample.
 
     With more states than outputs it is not unique; returned is the most probable one under the process noise,

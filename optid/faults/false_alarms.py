@@ -13,17 +13,15 @@ A healthy record is rarely long enough for thresholds of its own: it raises thos
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array, check_probability
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 EXCEEDING = 50  # fewest simulated windows or alarms beyond thresholds; with fewer they are refused, or extrapolated
 COMMON = 0.1  # share of blocks by whose energies a healthy record is compared with the simulation
@@ -246,7 +244,7 @@ def common_excess(largest: Array, common: float) -> float:
     return 1.0
 
 
-def raise_thresholds(base: Calibration, model: "HammersteinSS", healthy: Data,
+def raise_thresholds(base: Calibration, model: HammersteinSS, healthy: Data,
                      watched: Callable[[Array, Array], Array]) -> Calibration:
     """Return thresholds with no more alarms on a healthy record than are due: those of `base` times a factor.
 

@@ -1,7 +1,7 @@
 """The signals of a simulated plant with faults; every kind of fault changes them in its own way."""
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,10 +9,8 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.errors import StructureError
 from optid.faults.places import channel_of, functions_of, matrices_of, place_of
+from optid.models import HammersteinSS
 from optid.models.kalman import NoiseCovariances
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 
 class Sensors(NamedTuple):
@@ -52,7 +50,7 @@ class FaultyPlant:
         stream: random numbers of its own.
     """
 
-    def __init__(self, model: "HammersteinSS", u: Array, present: NoiseCovariances | None,
+    def __init__(self, model: HammersteinSS, u: Array, present: NoiseCovariances | None,
                  process: Mapping[str, ArrayLike], healthy: np.random.Generator) -> None:
         """Set up a plant without faults, whose noise is drawn from `healthy`."""
         count, n, l = len(u), model.nx, model.l  # noqa: E741

@@ -1,7 +1,7 @@
 """Simulation of a plant with faults."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,11 +10,9 @@ from optid.arrays import Array, compact, one_or_all
 from optid.errors import DataError, StructureError
 from optid.faults.faults import Fault
 from optid.faults.faulty_plant import FaultyPlant
+from optid.models import HammersteinSS
 from optid.models.experiments import check_inputs, records_of, state_like
 from optid.models.kalman import NoiseCovariances
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 
 class Trajectory(NamedTuple):
@@ -39,7 +37,7 @@ class Surroundings(NamedTuple):
 
 
 def inject(
-    model: "HammersteinSS", u: Any, faults: Fault | Sequence[Fault] = (), *, seed: int | None = 0, x0: Any = "zero",
+    model: HammersteinSS, u: Any, faults: Fault | Sequence[Fault] = (), *, seed: int | None = 0, x0: Any = "zero",
     noise: NoiseCovariances | str = "model", process: Mapping[str, ArrayLike] | None = None, feedback: str = "measured",
 ) -> Any:
     """Simulate a plant with one or several faults.
@@ -75,7 +73,7 @@ def inject(
 
 
 def trajectory(
-    model: "HammersteinSS", u: ArrayLike, faults: Fault | Sequence[Fault] = (), *, seed: Any = 0,
+    model: HammersteinSS, u: ArrayLike, faults: Fault | Sequence[Fault] = (), *, seed: Any = 0,
     surroundings: Surroundings | None = None,
 ) -> Trajectory:
     """Simulate one record as `inject` does and return the states, too."""
@@ -106,7 +104,7 @@ def trajectory(
 
 
 def _broken(
-    model: "HammersteinSS", u: Array, faults: list[Fault], covariances: NoiseCovariances | None, seed: Any,
+    model: HammersteinSS, u: Array, faults: list[Fault], covariances: NoiseCovariances | None, seed: Any,
     process: Mapping[str, ArrayLike],
 ) -> FaultyPlant:
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
@@ -117,7 +115,7 @@ def _broken(
     return plant
 
 
-def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> NoiseCovariances | None:
+def _covariances(model: HammersteinSS, noise: NoiseCovariances | str) -> NoiseCovariances | None:
     if isinstance(noise, NoiseCovariances):
         if noise.S.shape != (model.nx, model.l):
             raise StructureError(f"noise: S has shape {noise.S.shape}; it must be {(model.nx, model.l)}.")
@@ -133,7 +131,7 @@ def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> Noise
     return model.noise
 
 
-def _started(model: "HammersteinSS", x0: Any, u: Array) -> Array:
+def _started(model: HammersteinSS, x0: Any, u: Array) -> Array:
     if not isinstance(x0, str):
         return np.array(state_like(x0, (model.nx,)))
     if x0 == "zero":

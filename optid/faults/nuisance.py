@@ -33,7 +33,7 @@ it is multiplied by d^2.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,11 +46,9 @@ from optid.faults.false_alarms import CONFIDENCE
 from optid.faults.ranges import BEYOND, distance, outside, unknown_effects
 from optid.faults.screening import check_causality
 from optid.faults.whitening import Nuisance, Predictor, predictor, whiten
+from optid.models import HammersteinSS
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 MATRICES = ("A", "B", "C", "D", "E", "L", "K", "offset_x", "offset_y")
 
@@ -83,7 +81,7 @@ class ModelUncertainty:
     curvature: Products | None = None
 
     @cached_property
-    def moves(self) -> "list[tuple[HammersteinSS, HammersteinSS, float]]":
+    def moves(self) -> list[tuple[HammersteinSS, HammersteinSS, float]]:
         """Two models on both sides along every column of root, and the factor of their difference."""
         theta, steps, back = parameters(self.model)
         root = self.root[: len(theta)]  # those of the model
@@ -173,7 +171,7 @@ class ModelUncertainty:
 
 
 def model_uncertainty(
-    model: "HammersteinSS", data: Data, *, healthy: Data | None = None, decoupled: Predictor | None = None,
+    model: HammersteinSS, data: Data, *, healthy: Data | None = None, decoupled: Predictor | None = None,
 ) -> ModelUncertainty:
     """Return the covariance of the parameters of a model, from the record it was identified from.
 
@@ -358,13 +356,13 @@ def largest_factor(s2: Array, z2: Array) -> float:
     return float(allowed[-1]) if allowed.size else 1.0
 
 
-def uncertain_start(model: "HammersteinSS", steady: Predictor) -> ModelUncertainty:
+def uncertain_start(model: HammersteinSS, steady: Predictor) -> ModelUncertainty:
     """Return the uncertainty of an exact model in records whose initial state is estimated."""
     gained = replace(model, K=steady.K)
     return ModelUncertainty(gained, steady, np.zeros((len(parameters(gained)[0]), 0)), 0)
 
 
-def parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], "HammersteinSS"]]:
+def parameters(model: HammersteinSS) -> tuple[Array, Array, Callable[[Array], HammersteinSS]]:
     """Return the parameters, a step for each, and the function that builds the model of given parameters."""
     used = [name for name in MATRICES if np.any(getattr(model, name))]
     functions = [*model.nonlinearities, *model.feedback]
@@ -372,7 +370,7 @@ def parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], 
     steps = [STEP * (np.abs(part) + np.sqrt(np.mean(part**2)) + 1e-8) for part in parts if part.size]
     edges = np.cumsum([0, *(part.size for part in parts)])
 
-    def back(theta: Array) -> "HammersteinSS":
+    def back(theta: Array) -> HammersteinSS:
         cut = [theta[a:b] for a, b in zip(edges, edges[1:])]
         changes: dict[str, Any] = {
             name: part.reshape(np.shape(getattr(model, name))) for name, part in zip(used, cut)}

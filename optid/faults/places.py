@@ -1,19 +1,17 @@
 """Places of faults: where the name of a fault enters the equations of a model, and the matrices of a schedule."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import LookupFailed, StructureError, nearest
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 
-def place_of(model: "HammersteinSS", name: str, direction: Any = None,
+def place_of(model: HammersteinSS, name: str, direction: Any = None,
              process: Mapping[str, ArrayLike] | None = None) -> tuple[Array, Array]:
     """Return where an additive fault enters: the state equation (n, d) and the output equation (l, d).
 
@@ -71,7 +69,7 @@ def channel_of(names: tuple[str, ...], name: str) -> int:
     return names.index(channel)
 
 
-def functions_of(model: "HammersteinSS", name: str) -> list[int]:
+def functions_of(model: HammersteinSS, name: str) -> list[int]:
     """Return the functions of the input that the name of a fault ends in; errors as `channel_of`."""
     c = channel_of(model.inputs, name)
     return [i for i, of in enumerate(model.input_of) if of == c]

@@ -8,17 +8,15 @@ innovations and signatures like the unknown initial state. A record in which a l
 outside too often, is used up to that sample.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.bases import Linear, UserFunctions
 from optid.errors import DataError
+from optid.models import HammersteinSS
 from optid.models.model import impulse_response
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 TOLERATED = 0.02  # share of the range by which an input may leave it as long as no output shows it
 UNSEEN = 0.1  # largest shift of an output by the unknown effect that is tolerated, in standard deviations of the noise
@@ -60,7 +58,7 @@ class Outside(NamedTuple):
             f"{self.samples.size} samples, first in sample {self.samples[0]}: its effect there is not judged.")
 
 
-def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
+def outside(model: HammersteinSS, u: Array) -> list[Outside]:
     """Return the inputs (N, m) that leave the range their nonlinearities were identified over.
 
     A function without an interval, or one that the user gave, is known everywhere.
@@ -76,7 +74,7 @@ def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
     return found
 
 
-def usable_range(model: "HammersteinSS") -> tuple[Array, Array]:
+def usable_range(model: HammersteinSS) -> tuple[Array, Array]:
     """Return (low, high), both (K,): `known_range`, and for linear functions how far they are extrapolated."""
     low, high = known_range(model)
     for column, f in enumerate(model.nonlinearities):
@@ -86,7 +84,7 @@ def usable_range(model: "HammersteinSS") -> tuple[Array, Array]:
     return low, high
 
 
-def input_range_notes(model: "HammersteinSS", u: Array) -> list[str]:
+def input_range_notes(model: HammersteinSS, u: Array) -> list[str]:
     """State the inputs (N, m) whose linear functions are extrapolated, and since when."""
     (low, high), notes = known_range(model), []
     for column, f in enumerate(model.nonlinearities):
@@ -99,7 +97,7 @@ def input_range_notes(model: "HammersteinSS", u: Array) -> list[str]:
     return notes
 
 
-def usable_samples(model: "HammersteinSS", u: Array) -> tuple[int, str]:
+def usable_samples(model: HammersteinSS, u: Array) -> tuple[int, str]:
     """Return how many samples of inputs (N, m) are used, and why not all of them; "" where all are.
 
     Raises:
@@ -120,7 +118,7 @@ def usable_samples(model: "HammersteinSS", u: Array) -> tuple[int, str]:
                         f"{one.interval[1]:.4g}].")
 
 
-def known_range(model: "HammersteinSS") -> tuple[Array, Array]:
+def known_range(model: HammersteinSS) -> tuple[Array, Array]:
     """Return (low, high), both (K,), between which every function of an input is known with sufficient accuracy.
 
     This is its interval, extended by `TOLERATED` of its length, or by less where the outputs would show the difference
@@ -141,7 +139,7 @@ def known_range(model: "HammersteinSS") -> tuple[Array, Array]:
     return low, high
 
 
-def by_input(model: "HammersteinSS", ends: tuple[Array, Array]) -> Array:
+def by_input(model: HammersteinSS, ends: tuple[Array, Array]) -> Array:
     """Return ranges (2, m) of the inputs, from those of their functions, low and high (K,); infinite without any."""
     found = np.full((2, model.m), np.inf) * [[-1.0], [1.0]]
     np.maximum.at(found[0], list(model.input_of), ends[0])
@@ -149,7 +147,7 @@ def by_input(model: "HammersteinSS", ends: tuple[Array, Array]) -> Array:
     return found
 
 
-def unsure_since(model: "HammersteinSS", u: Array, memory: int) -> np.ndarray:
+def unsure_since(model: HammersteinSS, u: Array, memory: int) -> np.ndarray:
     """Return which samples (N,) follow an input outside its range within `memory` samples."""
     edges = np.zeros(len(u) + memory + 2, dtype=int)
     for one in outside(model, u):
@@ -158,7 +156,7 @@ def unsure_since(model: "HammersteinSS", u: Array, memory: int) -> np.ndarray:
     return np.cumsum(edges)[: len(u)] > 0
 
 
-def unknown_effects(model: "HammersteinSS", u: Array) -> tuple[Array, Array]:
+def unknown_effects(model: HammersteinSS, u: Array) -> tuple[Array, Array]:
     """Return the unknown effects outside the range in the state (N, n, K) and in the output (N, l, K).
 
     Raises:

@@ -32,6 +32,11 @@ class SensorFinding(NamedTuple):
     ended: bool  # whether it has ended
     note: str = ""
 
+    @property
+    def is_dead(self) -> bool:
+        """Whether there is no reading any more."""
+        return self.condition == "dead"
+
 
 @dataclass(frozen=True, eq=False)
 class LostReadings:
@@ -157,10 +162,10 @@ def lost_readings(y: Array, outputs: Sequence[str], experiment: int = 0) -> tupl
     for one in (one for one in found if not one.ended):
         last = next((e.sample for e in found if e.ended and e.output == one.output and e.sample > one.sample), len(y))
         own = y[one.onset : last, one.output]
-        value = float("nan") if one.condition == "dead" else float(own[0])
-        count = int(np.sum(np.isnan(own) if one.condition == "dead" else own == value))
+        value = float("nan") if one.is_dead else float(own[0])
+        count = int(np.sum(np.isnan(own) if one.is_dead else own == value))
         lines.append(LostReadings(f"sensor:{outputs[one.output]}", one.condition, experiment, one.onset, count, value))
-    for o in set(range(y.shape[1])) - {one.output for one in found if one.condition != "dead"}:
+    for o in set(range(y.shape[1])) - {one.output for one in found if not one.is_dead}:
         repeats = np.flatnonzero(y[1:, o] == y[:-1, o])
         if repeats.size >= FLAT - 1 and np.ptp(repeats) == repeats.size - 1 < 0.1 * len(y):
             first = int(repeats[0])

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from itertools import permutations, product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +14,8 @@ from optid.faults.whitening import predictor, whiten
 from optid.identify.informativity import informativity
 from optid.identify.informativity.feedback import TIED, outside
 from optid.identify.informativity.signals import RecordSignals
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 UNITS = (1000.0, 100.0, 60.0, 25.4, 10.0, 9.81, 9 / 5, np.pi / 180)
 FACTORS = (*UNITS, *(1 / unit for unit in UNITS))  # factors between units of the same quantity
@@ -30,7 +28,7 @@ def flat_lines(data: Data) -> tuple[LostReadings, ...]:
     return tuple(line for lines in found for line in lines if not line.is_dead)
 
 
-def check_channels(model: "HammersteinSS", data: Data) -> None:
+def check_channels(model: HammersteinSS, data: Data) -> None:
     """Refuse a healthy record with swapped outputs or inputs, or with a change of unit.
 
     The criterion is the energy of the innovations: another order of the channels, or another factor of an output from
@@ -69,7 +67,7 @@ def check_channels(model: "HammersteinSS", data: Data) -> None:
                 f"fit the model when divided by {found[1]:g}. Convert them.")
 
 
-def check_causality(model: "HammersteinSS", data: Data) -> None:
+def check_causality(model: HammersteinSS, data: Data) -> None:
     """Refuse a model of the inverse of a controller.
 
     Where an input is the answer of a controller and nothing else, a model in which it acts on the outputs at once
@@ -102,7 +100,7 @@ def _check_order(what: str, names: tuple[str, ...], energy: float, of: Callable[
             f"model predicts the outputs {energy / trials[best]:.0f} times better. Check the names of the columns.")
 
 
-def _unit_jump(model: "HammersteinSS", alone: Data, o: int) -> tuple[int, float] | None:
+def _unit_jump(model: HammersteinSS, alone: Data, o: int) -> tuple[int, float] | None:
     """First sample and factor of a change of unit that explains a record of one experiment."""
     energy, found = _energy(model, alone), whiten(model, alone)
     large = np.abs(found.innovations[:, o]) / np.sqrt(predictor(model).covariance[o, o])
@@ -115,7 +113,7 @@ def _unit_jump(model: "HammersteinSS", alone: Data, o: int) -> tuple[int, float]
     return None
 
 
-def _energy(model: "HammersteinSS", data: Data) -> float:
+def _energy(model: HammersteinSS, data: Data) -> float:
     """Energy of the innovations; infinite where the model is not defined for the inputs."""
     try:
         found: list[Any] = as_list(whiten(model, data))

@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,9 +16,7 @@ from optid.faults.kinds import FaultKind, all_kinds, kind_of
 from optid.faults.places import channel_of, place_of
 from optid.faults.ranges import known_range
 from optid.faults.whitening import Predictor, predictor
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 STANDING, STATE_JUMP = "stuck", "jump"
 """The kind of an actuator to whose effect any constant is added, and that of the state by default."""
@@ -101,7 +98,7 @@ class Candidate:
         """The same actuator with any constant added beside the share lost."""
         return replace(self, kind=STANDING)
 
-    def rest_values(self, model: "HammersteinSS") -> Array:
+    def rest_values(self, model: HammersteinSS) -> Array:
         """Return the functions of the inputs (r,) at the input without effect, from which a share lost counts."""
         if self.zero is None or self.has_constants:
             return np.zeros(model.B.shape[1])
@@ -122,7 +119,7 @@ class Dictionary:
         unknown: whether "none of these" is a possible answer.
     """
 
-    model: "HammersteinSS"
+    model: HammersteinSS
     predictor: Predictor
     candidates: tuple[Candidate, ...]
     excluded: Mapping[str, str]
@@ -145,7 +142,7 @@ class Dictionary:
         rows, columns = np.nonzero(np.triu(np.nan_to_num(self.sines, nan=1.0) < NEAR, 1))
         return [(self.labels[i], self.labels[j], float(self.sines[i, j])) for i, j in zip(rows, columns)]
 
-    def belongs_to(self, model: "HammersteinSS") -> bool:
+    def belongs_to(self, model: HammersteinSS) -> bool:
         """Whether it is a dictionary of a model, with disturbances declared or not."""
         same = self.model is model or all(
             np.array_equal(getattr(self.model, name), getattr(model, name)) for name in "ABCDEL")
@@ -213,7 +210,7 @@ class Dictionary:
 
 
 def dictionary(
-    model: "HammersteinSS", *, actuators: str | Sequence[str] = "all", sensors: str | Sequence[str] = "all",
+    model: HammersteinSS, *, actuators: str | Sequence[str] = "all", sensors: str | Sequence[str] = "all",
     kinds: str | Sequence[str] = ("bias",), process: Mapping[str, ArrayLike] | None = None, state_jump: bool = True,
     schedules: Mapping[str, Fault] | None = None, unknown: bool = True, zeros: Mapping[str, float] | None = None,
     disturbances: Sequence[str] = (),
@@ -292,7 +289,7 @@ def _chosen(wanted: str | Sequence[str], names: tuple[str, ...]) -> list[str]:
 
 
 def candidate_of(
-    model: "HammersteinSS", name: str, kind: str, process: Mapping[str, ArrayLike] | None = None,
+    model: HammersteinSS, name: str, kind: str, process: Mapping[str, ArrayLike] | None = None,
     zeros: Mapping[str, float] | None = None,
 ) -> Candidate:
     """Return a candidate by its name and kind; arguments and errors as of `place_of` and `dictionary`."""
@@ -305,7 +302,7 @@ def candidate_of(
     return replace(new, members=(new.own_label,))
 
 
-def _check_zero(model: "HammersteinSS", name: str, value: float) -> None:
+def _check_zero(model: HammersteinSS, name: str, value: float) -> None:
     """Refuse an input without effect that lies where its function is not known."""
     for column, (low, high) in enumerate(zip(*known_range(model))):
         if model.inputs[model.input_of[column]] != name or low <= value <= high:

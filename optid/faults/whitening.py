@@ -2,22 +2,20 @@
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array, as_list, compact, one_or_all
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.models import HammersteinSS
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
 from optid.models.recursions import SHORT, propagate
 from optid.models.roots import spectral_radius
 from optid.phrases import p_value
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 LAGS = 20  # lags of the whiteness test
 NOT_WHITE = 1e-3  # p-value of whiteness below which thresholds are refused
@@ -98,7 +96,7 @@ class Predictor:
         return self.whiten(changes, present).reshape(present.size, -1)
 
 
-def predictor(model: "HammersteinSS") -> Predictor:
+def predictor(model: HammersteinSS) -> Predictor:
     """Return the steady Kalman predictor of a model with noise covariances.
 
     Raises:
@@ -172,7 +170,7 @@ class Whitened:
 
 
 def check_window(
-    model: "HammersteinSS", whitened: Whitened, what: str, onset: int = 0, longest: float = np.inf
+    model: HammersteinSS, whitened: Whitened, what: str, onset: int = 0, longest: float = np.inf
 ) -> None:
     """Refuse whitened innovations that a search or a test (`what`) of at most `longest` readings cannot take.
 
@@ -198,7 +196,7 @@ def check_window(
 
 
 def whiten(
-    model: "HammersteinSS", data: Data, *, x0: Any = "fit", uncertainty: Any = None,
+    model: HammersteinSS, data: Data, *, x0: Any = "fit", uncertainty: Any = None,
     scale: Predictor | None = None,
 ) -> Any:
     """Return the whitened innovations of a record; a tuple for several experiments.

@@ -13,16 +13,13 @@ are among them: then neither one that drifts nor one beside an actuator is added
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.faults.diagnosis.posterior import Explanation, share_bound, share_prior
 from optid.faults.signatures import Candidate, Dictionary, candidate_of
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 UNLISTED = 0.1  # prior of a fault outside the dictionary, relative to one inside
 LEAK = "bias"  # kind of the disturbance of unknown direction that always competes
@@ -130,7 +127,7 @@ def _stuck(found: Explanation, first: int) -> Explanation:
     )
 
 
-def final_effect(model: "HammersteinSS", name: str, size: Array) -> dict[str, float]:
+def final_effect(model: HammersteinSS, name: str, size: Array) -> dict[str, float]:
     """Return the steady-state effect on every output of a constant disturbance of estimated direction (n,).
 
     It is empty for other faults and for unknown sizes.

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,10 +28,8 @@ from optid.faults.nuisance import uncertain_start
 from optid.faults.ranges import input_range_notes, outside, usable_samples
 from optid.faults.screening import check_channels
 from optid.faults.signatures import Dictionary, dictionary
+from optid.models import HammersteinSS
 from optid.threads import one_thread
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 KINDS = "bias", "loss", "spike"  # kinds of faults of the default dictionary
 
@@ -95,7 +93,7 @@ def diagnose(
     return results[0] if len(results) == 1 else tuple(results)
 
 
-def _dictionary(model: "HammersteinSS", faults: Dictionary | None) -> Dictionary:
+def _dictionary(model: HammersteinSS, faults: Dictionary | None) -> Dictionary:
     if faults is None:
         return dictionary(model, kinds=KINDS)
     if not isinstance(faults, Dictionary):

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,13 +14,11 @@ from optid.faults.readings import LostReadings, lost_readings
 from optid.faults.screening import check_channels
 from optid.faults.signatures import Dictionary, candidate_of
 from optid.faults.whitening import Predictor, health, predictor, whiten
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
 
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
-
-def plant_of(model: Any) -> "tuple[HammersteinSS, Data | None]":
+def plant_of(model: Any) -> tuple[HammersteinSS, Data | None]:
     """Return the state-space model (else a `StructureError`), and the record it was identified from, of a fit."""
     fitted, data = getattr(model, "model", model), getattr(model, "data", None)
     if getattr(fitted, "kind", "") != "HammersteinSS":
@@ -31,7 +29,7 @@ def plant_of(model: Any) -> "tuple[HammersteinSS, Data | None]":
     return fitted, data if isinstance(data, Data) else None
 
 
-def record_of(model: "HammersteinSS", data: Any) -> Data:
+def record_of(model: HammersteinSS, data: Any) -> Data:
     """Return a record in raw units with the channels of the model, from any of the forms that `diagnose` takes.
 
     Raises:
@@ -61,7 +59,7 @@ def record_of(model: "HammersteinSS", data: Any) -> Data:
     return raw
 
 
-def steady_predictor(model: "HammersteinSS", healthy: Any, rescale: bool) -> Predictor | None:
+def steady_predictor(model: HammersteinSS, healthy: Any, rescale: bool) -> Predictor | None:
     """Return the predictor with the noise scale of a healthy record; None for that of the model.
 
     Raises:
@@ -79,7 +77,7 @@ def steady_predictor(model: "HammersteinSS", healthy: Any, rescale: bool) -> Pre
 
 
 def uncertainty_of(
-    model: "HammersteinSS", data: Data | None, wanted: Any, decoupled: Predictor | None = None
+    model: HammersteinSS, data: Data | None, wanted: Any, decoupled: Predictor | None = None
 ) -> tuple[ModelUncertainty | None, str]:
     """Return the uncertainty of the model to use, and a remark for the report.
 

@@ -97,7 +97,7 @@ class ReadingChecks:
                 found.events.append(Event("cleared", one.sample, label))
                 continue
             found.events.append(Event("isolated", one.sample, label, one.onset, note=one.note))
-            if one.condition != "dead":
+            if not one.is_dead:
                 k = one.sample - start
                 found.frozen[k] = min(one.onset, found.frozen.get(k, one.onset))
         found.events.sort(key=lambda e: e.sample)
