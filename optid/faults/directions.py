@@ -27,9 +27,8 @@ GENERIC = np.exp(0.7j) * 1.3
 """Point of the z plane at which the rank of the transfer matrix from disturbances to outputs is computed."""
 
 
-def decouple(
-    model: HammersteinSS, disturbances: Sequence[str], process: Mapping[str, ArrayLike] | None = None
-) -> tuple[HammersteinSS, Predictor]:
+def decouple(model: HammersteinSS, disturbances: Sequence[str],
+             process: Mapping[str, ArrayLike] | None = None) -> tuple[HammersteinSS, Predictor]:
     """Return a model whose noise includes disturbances of any course, and the predictor decoupled from them.
 
     Args:

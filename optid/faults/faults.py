@@ -99,9 +99,8 @@ class Fault:
         return slice(int(self.onset), count if self.end is None else min(int(self.end), count))
 
     @classmethod
-    def step(
-        cls, name: str, onset: int, size: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
-    ) -> "Fault":
+    def step(cls, name: str, onset: int, size: ArrayLike, *, end: int | None = None,
+             direction: ArrayLike | None = None) -> "Fault":
         """Return a constant offset from the onset on, (1.8) and (1.9).
 
         Args:
@@ -122,9 +121,8 @@ class Fault:
         return cls(name, kind, onset, None, _finite(name, size, "size"), _finite(name, direction, "direction"))
 
     @classmethod
-    def ramp(
-        cls, name: str, onset: int, slope: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
-    ) -> "Fault":
+    def ramp(cls, name: str, onset: int, slope: ArrayLike, *, end: int | None = None,
+             direction: ArrayLike | None = None) -> "Fault":
         """Return a drift: slope at the onset, twice the slope one sample later, .... Arguments as `step`."""
         return cls(name, "drift", onset, end, _finite(name, slope, "size"), _finite(name, direction, "direction"))
 
@@ -169,10 +167,9 @@ class Fault:
         return cls(name, "hard_over", onset, end, None if value is None else float(_finite(name, value, "value")))
 
     @classmethod
-    def process_noise(
-        cls, name: str, onset: int, *, std: float | None = None, scale: float | None = None,
-        covariance: ArrayLike | None = None, end: int | None = None, direction: ArrayLike | None = None,
-    ) -> "Fault":
+    def process_noise(cls, name: str, onset: int, *, std: float | None = None, scale: float | None = None,
+                      covariance: ArrayLike | None = None, end: int | None = None,
+                      direction: ArrayLike | None = None) -> "Fault":
         """Return additional white noise in the state equation, (1.12).
 
         The name is "process:load" along a direction, or "process" in all states. Give one (`StructureError`) of std,
@@ -183,10 +180,8 @@ class Fault:
                    *_noise(name, std, scale, covariance))
 
     @classmethod
-    def sensor_noise(
-        cls, name: str, onset: int, *, std: float | None = None, scale: float | None = None,
-        covariance: ArrayLike | None = None, end: int | None = None,
-    ) -> "Fault":
+    def sensor_noise(cls, name: str, onset: int, *, std: float | None = None, scale: float | None = None,
+                     covariance: ArrayLike | None = None, end: int | None = None) -> "Fault":
         """Return additional white noise of a sensor, (1.13); "sensor" alone is all of them. As `process_noise`."""
         return cls(name, "noise", onset, end, None, None, 0.0, *_noise(name, std, scale, covariance))
 

@@ -36,10 +36,9 @@ class Surroundings(NamedTuple):
     feedback: str = "measured"
 
 
-def inject(
-    model: HammersteinSS, u: Any, faults: Fault | Sequence[Fault] = (), *, seed: int | None = 0, x0: Any = "zero",
-    noise: NoiseCovariances | str = "model", process: Mapping[str, ArrayLike] | None = None, feedback: str = "measured",
-) -> Any:
+def inject(model: HammersteinSS, u: Any, faults: Fault | Sequence[Fault] = (), *, seed: int | None = 0,
+           x0: Any = "zero", noise: NoiseCovariances | str = "model", process: Mapping[str, ArrayLike] | None = None,
+           feedback: str = "measured") -> Any:
     """Simulate a plant with one or several faults.
 
     The noise of the healthy plant is the same with and without faults for the same seed. Losses and stuck actuators act
@@ -72,10 +71,8 @@ def inject(
         for (inputs, _, _), own in zip(records, seeds)])
 
 
-def trajectory(
-    model: HammersteinSS, u: ArrayLike, faults: Fault | Sequence[Fault] = (), *, seed: Any = 0,
-    surroundings: Surroundings | None = None,
-) -> Trajectory:
+def trajectory(model: HammersteinSS, u: ArrayLike, faults: Fault | Sequence[Fault] = (), *, seed: Any = 0,
+               surroundings: Surroundings | None = None) -> Trajectory:
     """Simulate one record as `inject` does and return the states, too."""
     from optid.faults.kernels import march_faulty
     from optid.models.state_kernels import INSIDE, REFUSED
@@ -103,10 +100,8 @@ def trajectory(
     return Trajectory(readings, states)
 
 
-def _broken(
-    model: HammersteinSS, u: Array, faults: list[Fault], covariances: NoiseCovariances | None, seed: Any,
-    process: Mapping[str, ArrayLike],
-) -> FaultyPlant:
+def _broken(model: HammersteinSS, u: Array, faults: list[Fault], covariances: NoiseCovariances | None, seed: Any,
+            process: Mapping[str, ArrayLike]) -> FaultyPlant:
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     healthy, *streams = (np.random.default_rng(s) for s in root.spawn(len(faults) + 1))
     plant = FaultyPlant(model, u, covariances, process, healthy)

@@ -104,11 +104,9 @@ class Isolability(Rendered):
         return [tuple(label.split(" | ")) for label in self.labels if " | " in label]
 
 
-def isolability(
-    found: Dictionary, window: int = 100, *, onset: int | str = "unknown", prob: float = 0.95,
-    false_alarm: float = 0.01, draws: int = 1000, calibration: int = 20_000, seed: int | None = 0,
-    u: ArrayLike | None = None,
-) -> Isolability:
+def isolability(found: Dictionary, window: int = 100, *, onset: int | str = "unknown", prob: float = 0.95,
+                false_alarm: float = 0.01, draws: int = 1000, calibration: int = 20_000, seed: int | None = 0,
+                u: ArrayLike | None = None) -> Isolability:
     """Return the smallest detectable and isolable size of every fault, by simulating the search for it at all sizes.
 
     Args:
@@ -185,9 +183,8 @@ def _scores(space: Sweep, windows: Array) -> list[Array]:
     return [space.coordinates(found, int(c))[:, space.tested[c]] for c in np.flatnonzero(space.tables.sizes)]
 
 
-def _curves(
-    space: Sweep, place: int, noise: list[Array], thresholds: Array, known: int | None, rng: np.random.Generator
-) -> tuple[Array, Array, Array, Array, float]:
+def _curves(space: Sweep, place: int, noise: list[Array], thresholds: Array, known: int | None,
+            rng: np.random.Generator) -> tuple[Array, Array, Array, Array, float]:
     """Probabilities of one fault over the grid of deflections, and the deflection of a size of one.
 
     They are those of detection (G,), of isolation (G,), of detection and preference to each other candidate (C, G), in
@@ -217,9 +214,7 @@ def _curves(
     return detected, isolated, preferred, accused, unit
 
 
-def _directions(
-    space: Sweep, c: int, known: int | None, draws: int, rng: np.random.Generator
-) -> tuple[Array, float]:
+def _directions(space: Sweep, c: int, known: int | None, draws: int, rng: np.random.Generator) -> tuple[Array, float]:
     """Return sizes (M, d) of deflection one in mid-window, in random directions, and the deflection of a unit size."""
     onset = space.window // 2 if known is None else known
     trace = space.signature(c, onset)

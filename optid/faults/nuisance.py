@@ -170,9 +170,8 @@ class ModelUncertainty:
         return Nuisance(U, s, unknown)
 
 
-def model_uncertainty(
-    model: HammersteinSS, data: Data, *, healthy: Data | None = None, decoupled: Predictor | None = None,
-) -> ModelUncertainty:
+def model_uncertainty(model: HammersteinSS, data: Data, *, healthy: Data | None = None,
+                      decoupled: Predictor | None = None) -> ModelUncertainty:
     """Return the covariance of the parameters of a model, from the record it was identified from.
 
     All entries of the matrices that are not zero throughout, the gain, the offsets and the coefficients of the

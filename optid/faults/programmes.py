@@ -41,9 +41,8 @@ def signature_estimate(found: "Scan", limits: "Thresholds", **how: Any) -> "Spar
     return solve_registered("fault.signature", found, limits, **how)
 
 
-def membership(
-    model: Any, data: "Data", bounds: Any = None, faults: "Dictionary | None" = None, **how: Any
-) -> "Membership":
+def membership(model: Any, data: "Data", bounds: Any = None, faults: "Dictionary | None" = None,
+               **how: Any) -> "Membership":
     """Prove by linear programming that no healthy plant within bounds of its noise made a window (`fault.membership`).
 
     Bounds are a number of standard deviations (three by default) or {"process": (n,), "output": (l,)}; candidates of

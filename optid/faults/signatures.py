@@ -209,12 +209,10 @@ class Dictionary:
         return "\n".join(lines + ["  unknown: none of these"] * self.unknown)
 
 
-def dictionary(
-    model: HammersteinSS, *, actuators: str | Sequence[str] = "all", sensors: str | Sequence[str] = "all",
-    kinds: str | Sequence[str] = ("bias",), process: Mapping[str, ArrayLike] | None = None, state_jump: bool = True,
-    schedules: Mapping[str, Fault] | None = None, unknown: bool = True, zeros: Mapping[str, float] | None = None,
-    disturbances: Sequence[str] = (),
-) -> Dictionary:
+def dictionary(model: HammersteinSS, *, actuators: str | Sequence[str] = "all", sensors: str | Sequence[str] = "all",
+               kinds: str | Sequence[str] = ("bias",), process: Mapping[str, ArrayLike] | None = None,
+               state_jump: bool = True, schedules: Mapping[str, Fault] | None = None, unknown: bool = True,
+               zeros: Mapping[str, float] | None = None, disturbances: Sequence[str] = ()) -> Dictionary:
     """Build the dictionary of possible faults; merge those that are not isolable, exclude those without effect.
 
     Args:
@@ -288,10 +286,8 @@ def _chosen(wanted: str | Sequence[str], names: tuple[str, ...]) -> list[str]:
     return chosen
 
 
-def candidate_of(
-    model: HammersteinSS, name: str, kind: str, process: Mapping[str, ArrayLike] | None = None,
-    zeros: Mapping[str, float] | None = None,
-) -> Candidate:
+def candidate_of(model: HammersteinSS, name: str, kind: str, process: Mapping[str, ArrayLike] | None = None,
+                 zeros: Mapping[str, float] | None = None) -> Candidate:
     """Return a candidate by its name and kind; arguments and errors as of `place_of` and `dictionary`."""
     into_state, into_output = place_of(model, name, None, process)
     new = Candidate(name, kind, into_state, into_output, places=(name,))

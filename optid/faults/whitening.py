@@ -50,9 +50,8 @@ class Predictor:
         radius = float(np.max(np.abs(np.linalg.eigvals(self.F)), initial=0.0))
         return len(self.F) if radius == 0 else len(self.F) + int(np.ceil(np.log(1e-6) / np.log(min(radius, 1 - 1e-9))))
 
-    def respond(
-        self, into_state: Array, into_output: Array, present: Array | None = None, A: Array | None = None
-    ) -> Array:
+    def respond(self, into_state: Array, into_output: Array, present: Array | None = None,
+                A: Array | None = None) -> Array:
         """Return the response (N, l, d) of the innovations to additions to x(k) (N, n, d) and to y(k) (N, l, d).
 
         All readings are `present` (N, l) by default, and the plant does not change; else it has A (N, n, n).
@@ -169,9 +168,7 @@ class Whitened:
         return white if self.nuisance is None else self.nuisance(white)
 
 
-def check_window(
-    model: HammersteinSS, whitened: Whitened, what: str, onset: int = 0, longest: float = np.inf
-) -> None:
+def check_window(model: HammersteinSS, whitened: Whitened, what: str, onset: int = 0, longest: float = np.inf) -> None:
     """Refuse whitened innovations that a search or a test (`what`) of at most `longest` readings cannot take.
 
     Raises:
@@ -195,10 +192,8 @@ def check_window(
         raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
 
 
-def whiten(
-    model: HammersteinSS, data: Data, *, x0: Any = "fit", uncertainty: Any = None,
-    scale: Predictor | None = None,
-) -> Any:
+def whiten(model: HammersteinSS, data: Data, *, x0: Any = "fit", uncertainty: Any = None,
+           scale: Predictor | None = None) -> Any:
     """Return the whitened innovations of a record; a tuple for several experiments.
 
     A missing reading is not used for correction.

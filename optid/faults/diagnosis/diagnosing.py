@@ -35,12 +35,10 @@ KINDS = "bias", "loss", "spike"  # kinds of faults of the default dictionary
 
 
 @one_thread
-def diagnose(
-    model: Any, data: Any, faults: Dictionary | None = None, *, false_alarm: float = 0.01, max_faults: int = 1,
-    method: str = "exact", model_uncertainty: Any = None, coverage: float = 0.95, robust: bool = False,
-    healthy: Any = None, rescale: bool = False, thresholds: Thresholds | None = None, seed: int | None = 0,
-    solver: Any = "auto",
-) -> Any:
+def diagnose(model: Any, data: Any, faults: Dictionary | None = None, *, false_alarm: float = 0.01, max_faults: int = 1,
+             method: str = "exact", model_uncertainty: Any = None, coverage: float = 0.95, robust: bool = False,
+             healthy: Any = None, rescale: bool = False, thresholds: Thresholds | None = None, seed: int | None = 0,
+             solver: Any = "auto") -> Any:
     """Diagnose a record: healthy or faulty, which fault, its onset and size.
 
     Every candidate of the dictionary is tried at every onset; the answer is a set of candidates that contains the true

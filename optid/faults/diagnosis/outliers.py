@@ -26,9 +26,8 @@ AT_ONCE = 4  # largest number of faults whose signatures are not clipped
 LIKELY = 5.0  # least log-likelihood ratio of such a fault against the healthy plant
 
 
-def cleaned(
-    found: Dictionary, part: Experiment, whitened_of: Callable[[Experiment], Whitened]
-) -> tuple[Scan, Experiment, tuple[tuple[int, int], ...]]:
+def cleaned(found: Dictionary, part: Experiment,
+            whitened_of: Callable[[Experiment], Whitened]) -> tuple[Scan, Experiment, tuple[tuple[int, int], ...]]:
     """Return the search of the clipped innovations, the record without outliers, and these as (sample, output)."""
     wide, taken, whitened = with_spikes(found), [], whitened_of(part)
     while len(taken) < MOST * whitened.present.sum():

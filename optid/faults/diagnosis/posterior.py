@@ -11,17 +11,15 @@ onset; the interval cuts its tails. Measured in `benchmarks/faults/intervals.py`
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.faults.diagnosis.answers import Estimate
 from optid.faults.nuisance import Nuisance
+from optid.faults.search.scanning import Scan
 from optid.faults.signatures import Candidate
-
-if TYPE_CHECKING:
-    from optid.faults.search.scanning import Scan
 
 SPREADS = 2.0, 4.0, 9.0, 25.0, 100.0, 400.0  # squared deflections of the prior
 NEGLIGIBLE = 18.0  # logarithm of the ratio to the largest probability below which onsets are left out
@@ -46,7 +44,7 @@ class Explanation(NamedTuple):
     sizes: Array  # (K, d) magnitudes of all candidates by least squares, one after the other
     covariances: Array  # (K, d, d) for the onsets of the row
     energies: Array  # (K,) energy explained, or twice the gain in log-likelihood
-    search: "Scan | None" = None  # with the signatures; None for candidates without one
+    search: Scan | None = None  # with the signatures; None for candidates without one
     course: Callable[[int], Explained] | None = None  # in place of signatures, the fit to the window for an onset
     error: Nuisance | None = None  # of the signature, due to the uncertainty of an identified model
     # the candidates of the search of which the candidates are special cases; empty where they are the same
@@ -97,7 +95,7 @@ def marginal(energies: Array, dimension: int | np.ndarray) -> Array:
     return np.asarray(logsumexp(terms, axis=-1) - np.log(g.size))
 
 
-def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
+def single(scan: Scan, candidate: Candidate) -> Explanation | None:
     """Return the explanation by one candidate of a search; None where it is not tested."""
     c = scan.index(candidate)
     row = scan.statistic[c]
@@ -113,7 +111,7 @@ def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
     return found._replace(logs=found.logs + bounded_shares(found.candidates, found.sizes, found.covariances))
 
 
-def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int], reach: int) -> Explanation:
+def several(scan: Scan, candidates: Sequence[Candidate], onsets: Sequence[int], reach: int) -> Explanation:
     """Return the explanation by several candidates, over the onsets within reach of the given ones."""
     ranges = []
     for candidate, onset in zip(candidates, onsets):

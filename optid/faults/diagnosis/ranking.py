@@ -1,7 +1,7 @@
 """Explanations of a record by one or several candidates, ranked by probability, with their residuals."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,10 +22,8 @@ from optid.faults.diagnosis.posterior import Explanation, several, single, small
 from optid.faults.diagnosis.record_search import RecordSearch
 from optid.faults.programmes import solve_registered
 from optid.faults.search.scanning import scan
+from optid.faults.search.sparse import SparseResult
 from optid.faults.search.subsets import SubsetSearch, best_subsets
-
-if TYPE_CHECKING:
-    from optid.faults.search.sparse import SparseResult
 
 REACH = {1: 40, 2: 10, 3: 5, 4: 3}
 """Onsets on both sides of the best ones that are summed, by the number of faults; two for more faults."""

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from optid.arrays import Array, check_integer, check_probability
 from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError, nearest
 from optid.faults.diagnosis.alternatives import with_unlisted_candidates
+from optid.faults.diagnosis.answers import Remaining
 from optid.faults.diagnosis.courses import courses, without_signature
 from optid.faults.diagnosis.leftover import further_fault, remainder_test
 from optid.faults.diagnosis.outliers import cleaned, with_spikes
@@ -20,9 +21,6 @@ from optid.faults.false_alarms import EXCEEDING, Thresholds
 from optid.faults.search.scanning import Scan, scan, thresholds
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, whiten
-
-if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import Remaining
 
 METHODS = "exact", "sparse", "sparse+polish", "set"
 
@@ -72,7 +70,7 @@ class RecordSearch:
     limits: Thresholds | None  # thresholds of the search; None without a search
     gains: Array  # (C, N) statistics less thresholds; NaN where a candidate is not tested or not testable
     lost: dict[str, str]  # {label: why} of candidates that are not testable
-    healthy: "Remaining"  # residual of the healthy plant
+    healthy: Remaining  # residual of the healthy plant
     outliers: tuple[tuple[int, int], ...]  # (sample, output) of the removed readings
     narrower: "RecordSearch | None" = None  # the search of the same readings with fewer candidates; None without one
 
@@ -128,9 +126,8 @@ class RecordSearch:
         return wide if asked.robust else replace(wide, narrower=self)  # where outliers are removed, others may be
 
 
-def search_record(
-    record: Data, part: Experiment, found: Dictionary, asked: Question, noise: Mapping[str, Any]
-) -> RecordSearch:
+def search_record(record: Data, part: Experiment, found: Dictionary, asked: Question,
+                  noise: Mapping[str, Any]) -> RecordSearch:
     """Search one experiment; the arguments are attributes of `RecordSearch`.
 
     Raises:

@@ -76,9 +76,8 @@ def steady_predictor(model: HammersteinSS, healthy: Any, rescale: bool) -> Predi
     return found if rescale else None
 
 
-def uncertainty_of(
-    model: HammersteinSS, data: Data | None, wanted: Any, decoupled: Predictor | None = None
-) -> tuple[ModelUncertainty | None, str]:
+def uncertainty_of(model: HammersteinSS, data: Data | None, wanted: Any,
+                   decoupled: Predictor | None = None) -> tuple[ModelUncertainty | None, str]:
     """Return the uncertainty of the model to use, and a remark for the report.
 
     Wanted is None (where the record of the identification is known), "use" (without it a `StructureError`), "ignore",

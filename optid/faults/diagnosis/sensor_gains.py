@@ -37,9 +37,8 @@ REPEATED = 3
 AROUND = 12.0  # standard deviations of the share that are searched with the effect of uncertain parameters
 
 
-def sensor_gains(
-    found: Dictionary, white: Whitened, part: Experiment, uncertainty: ModelUncertainty | None
-) -> list[Explanation]:
+def sensor_gains(found: Dictionary, white: Whitened, part: Experiment,
+                 uncertainty: ModelUncertainty | None) -> list[Explanation]:
     """Return the explanations of a window by sensors of a dictionary that lost a share of their reading."""
     if white.states is None or found.model.feedback or np.any(found.model.L):
         return []

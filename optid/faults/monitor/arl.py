@@ -46,10 +46,8 @@ def reference_inputs(model: HammersteinSS, u: ArrayLike | None, window: int, see
     return model.expand_inputs(np.repeat(drawn, HOLD, axis=0))
 
 
-def calibrate(
-    search: Window, f: Array, arl0: float, *, samples: int | None = None, seed: int | None = 0,
-    extrapolate: bool = False, effect: Array | None = None,
-) -> Calibration:
+def calibrate(search: Window, f: Array, arl0: float, *, samples: int | None = None, seed: int | None = 0,
+              extrapolate: bool = False, effect: Array | None = None) -> Calibration:
     """Return the thresholds of a search, simulated once in a process; errors as of `Monitor`.
 
     Args:

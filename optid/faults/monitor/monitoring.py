@@ -53,12 +53,11 @@ class Monitor:
         source: origin of the stream in JSON types, kept with the state.
     """
 
-    def __init__(
-        self, model: HammersteinSS, faults: Dictionary | None = None, arl0: float = 10_000, window: int = 100,
-        seed: int | None = 0, thresholds: Any = None, *, x0: Any = "unknown", healthy: Data | None = None,
-        uncertainty: Data | ModelUncertainty | None = None, u: ArrayLike | None = None, samples: int | None = None,
-        extrapolate: bool = False, drift: float | None = None, **rules: float,
-    ) -> None:
+    def __init__(self, model: HammersteinSS, faults: Dictionary | None = None, arl0: float = 10_000, window: int = 100,
+                 seed: int | None = 0, thresholds: Any = None, *, x0: Any = "unknown", healthy: Data | None = None,
+                 uncertainty: Data | ModelUncertainty | None = None, u: ArrayLike | None = None,
+                 samples: int | None = None, extrapolate: bool = False, drift: float | None = None,
+                 **rules: float) -> None:
         """Set up a monitor; the thresholds are simulated unless they are known.
 
         Args:

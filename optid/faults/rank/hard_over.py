@@ -190,11 +190,9 @@ class HardOver:
         return "\n".join([*lines, *wrap(self.explain(), 80)])
 
 
-def hard_over_test(
-    data: Data, healthy: Data, *, model: HammersteinSS | None = None, order: int | None = None,
-    window: int | None = None, hop: int | None = None, block_rows: int = BLOCK_ROWS, instruments: str = "inputs",
-    level: float = LEVEL, white_sensors: bool = True,
-) -> HardOver:
+def hard_over_test(data: Data, healthy: Data, *, model: HammersteinSS | None = None, order: int | None = None,
+                   window: int | None = None, hop: int | None = None, block_rows: int = BLOCK_ROWS,
+                   instruments: str = "inputs", level: float = LEVEL, white_sensors: bool = True) -> HardOver:
     """Test a record for dead sensors and actuators, window by window.
 
     Args:
@@ -330,10 +328,8 @@ class _Tests:
         return tuple(rows), tuple(columns), frozenset(moving)
 
 
-def zero_test(
-    statistics: HankelStatistics, regression: ChannelRegression, *, rows: int, level: float,
-    scale: Array | None = None, healthy: Array | None = None,
-) -> ZeroTest:
+def zero_test(statistics: HankelStatistics, regression: ChannelRegression, *, rows: int, level: float,
+              scale: Array | None = None, healthy: Array | None = None) -> ZeroTest:
     """Test whether the coefficients of y on t are zero, given o, from the moments of windows of `rows` + reach samples.
 
     t and o lie within the first `rows` block rows. The scale is that of all healthy signals, and `healthy` (t, y) are
@@ -384,9 +380,8 @@ def coefficients(statistics: HankelStatistics, regression: RegressionRows) -> Ar
     return np.linalg.lstsq(triangle[:size, :size] / scale, triangle[:size, size:], rcond=1e-13)[0].T / scale
 
 
-def least_order(
-    statistics: HankelStatistics, regression: RegressionRows, healthy: Array, test: RankTest, order: int, scale: Array,
-) -> int:
+def least_order(statistics: HankelStatistics, regression: RegressionRows, healthy: Array, test: RankTest, order: int,
+                scale: Array) -> int:
     """Return the smallest order that a healthy plant, of this order and with Pi (y, z), may show on a window.
 
     Its outputs are Pi times the instruments and noise, so that Pi L11 Q2 is R22 of the window without noise. An order

@@ -183,10 +183,8 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
     return Scan(found, whitened, inputs, statistic, prepared, correlations)
 
 
-def thresholds(
-    found: Dictionary, window: int | Whitened, false_alarm: float = 0.01, *, u: ArrayLike | None = None,
-    draws: int = 20_000, seed: int | None = 0,
-) -> Thresholds:
+def thresholds(found: Dictionary, window: int | Whitened, false_alarm: float = 0.01, *, u: ArrayLike | None = None,
+               draws: int = 20_000, seed: int | None = 0) -> Thresholds:
     """Calibrate the search on simulated healthy windows.
 
     The thresholds are quantiles of the largest energy over the onsets, at one level for all candidates, such that the

@@ -101,9 +101,8 @@ class SubsetSearch:
         return "\n".join(lines)
 
 
-def best_subsets(
-    scan: Scan, thresholds: "Thresholds", *, max_faults: int = 2, near: np.ndarray | None = None
-) -> SubsetSearch:
+def best_subsets(scan: Scan, thresholds: "Thresholds", *, max_faults: int = 2,
+                 near: np.ndarray | None = None) -> SubsetSearch:
     """Search a window for up to `max_faults` faults, exactly: all subsets of candidates and onsets (F3, F4).
 
     Both of two faults may be of one candidate, as a fault that comes and goes.
@@ -143,9 +142,8 @@ def best_subsets(
     return SubsetSearch(scan, tuple(ranked), searched, subsets, alike)
 
 
-def exchange_search(
-    members: Sequence[Member], gain: float, best_beside: Callable[[Sequence[Member]], tuple[float, Member]]
-) -> tuple[float, list[Member]]:
+def exchange_search(members: Sequence[Member], gain: float,
+                    best_beside: Callable[[Sequence[Member]], tuple[float, Member]]) -> tuple[float, list[Member]]:
     """Return the gain and the members that no single exchange improves, from members of some gain.
 
     `best_beside` returns the best member beside some others, and the gain of all of them.

@@ -215,9 +215,7 @@ def _inputs(found: Dictionary, u: Any, window: int) -> Array:
     return inputs
 
 
-def _prepared(
-    found: Dictionary, white: Whitened, u: Array | None, able: tuple[bool, ...], once: bool = False
-) -> Sweep:
+def _prepared(found: Dictionary, white: Whitened, u: Array | None, able: tuple[bool, ...], once: bool = False) -> Sweep:
     from optid.faults.search.sweep_kernels import correlate, grams
 
     tables, window, nuisance = _tables(found, white, u, able), len(white.r), white.nuisance
