@@ -132,9 +132,8 @@ def given_thresholds(known: Any, labels: tuple[str, ...], arl0: float, window: i
     """
     if isinstance(known, Calibration):
         if known.labels != labels or known.window != window:
-            raise StructureError(
-                f"thresholds: they are those of {', '.join(known.labels)} in a window of {known.window}; this monitor "
-                f"searches for {', '.join(labels)} in {window}.")
+            raise StructureError(f"thresholds: they are those of {', '.join(known.labels)} in a window of "
+                                 f"{known.window}; this monitor searches for {', '.join(labels)} in {window}.")
         return known
     if isinstance(known, Mapping):
         missing = [label for label in labels if label not in known]
@@ -151,9 +150,8 @@ def check_draws(false_alarm: float, draws: int) -> None:
     """Refuse a probability outside (0, 1), and too few simulated windows for it."""
     check_probability(false_alarm, "false_alarm")
     if false_alarm * draws < EXCEEDING:
-        raise DataError(
-            f"{draws} simulated windows are too few for a false alarm in {1 / false_alarm:.3g}: use at least "
-            f"{int(np.ceil(EXCEEDING / false_alarm))} draws, or a higher probability.")
+        raise DataError(f"{draws} simulated windows are too few for a false alarm in {1 / false_alarm:.3g}: use at "
+                        f"least {int(np.ceil(EXCEEDING / false_alarm))} draws, or a higher probability.")
 
 
 def family_thresholds(statistics: Array, false_alarm: float) -> Array:

@@ -58,9 +58,8 @@ class Fault:
             raise StructureError(f"{self.name}: {error}") from None
         possible = (*self.fault_kind.places, *self.fault_kind.simulated)
         if self.place not in possible:
-            raise StructureError(
-                f"{self.name!r} cannot have a fault of kind {self.kind!r}: "
-                f"its name begins with {' or '.join(map(repr, possible))}, as in 'actuator:u1'.")
+            raise StructureError(f"{self.name!r} cannot have a fault of kind {self.kind!r}: its name begins with "
+                                 f"{' or '.join(map(repr, possible))}, as in 'actuator:u1'.")
         for word, value in (("onset", self.onset), ("end", self.end)):
             if value is not None and (value != int(value) or value < 0):
                 raise StructureError(f"{self.name}: {word} = {value!r}; it must be a nonnegative integer.")

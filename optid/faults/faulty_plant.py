@@ -76,9 +76,8 @@ class FaultyPlant:
         into_state, into_output = place_of(self.model, name, direction, self.process)
         size = np.asarray(size)
         if size.shape != (into_state.shape[1],):
-            raise StructureError(
-                f"{name}: size of shape {size.shape}; this place has {into_state.shape[1]} columns: give one entry "
-                "for each.")
+            raise StructureError(f"{name}: size of shape {size.shape}; this place has {into_state.shape[1]} columns: "
+                                 "give one entry for each.")
         added = np.zeros(len(self.jolt))
         added[self.now] = course(np.arange(self.now.stop - self.now.start))
         if name.startswith("actuator:"):  # through B(k), which may be scheduled

@@ -120,9 +120,8 @@ def _covariances(model: HammersteinSS, noise: NoiseCovariances | str) -> NoiseCo
     if noise != "model":
         raise StructureError(f"noise={noise!r}: use 'model', 'none' or NoiseCovariances.")
     if model.noise is None:
-        raise StructureError(
-            "The model has no noise covariances: estimate them with optid.noise.with_noise(model, data), or pass "
-            "noise='none' for a run without noise.")
+        raise StructureError("The model has no noise covariances: estimate them with optid.noise.with_noise(model, "
+                             "data), or pass noise='none' for a run without noise.")
     return model.noise
 
 

@@ -130,9 +130,8 @@ def isolability(found: Dictionary, window: int = 100, *, onset: int | str = "unk
         check_integer(value, word)
     check_integer(seed, "seed", 0, 2**63)
     if window * found.model.l * draws > NUMBERS:
-        raise StructureError(
-            f"window={window}: {draws} simulated windows of this length do not fit in memory: use at most "
-            f"{NUMBERS // (found.model.l * draws)} samples, or fewer draws.")
+        raise StructureError(f"window={window}: {draws} simulated windows of this length do not fit in memory: use at "
+                             f"most {NUMBERS // (found.model.l * draws)} samples, or fewer draws.")
     if not 0.5 <= prob < 1:
         raise StructureError(f"prob={prob!r}; it must be a probability from 0.5 to below 1.")
     if isinstance(onset, str) and onset != "unknown":
@@ -220,9 +219,8 @@ def _directions(space: Sweep, c: int, known: int | None, draws: int, rng: np.ran
     trace = space.signature(c, onset)
     values, axes = np.linalg.eigh(np.einsum("kop,koq->pq", trace, trace))
     if not values[-1] > 0:
-        raise DataError(
-            f"{space.found.labels[c]}: untestable, the input does not excite it after sample {onset}. Use a window in "
-            "which it moves.")
+        raise DataError(f"{space.found.labels[c]}: untestable, the input does not excite it after sample {onset}. Use "
+                        "a window in which it moves.")
     d = values.size
     if d == 1:
         unit = float(np.sqrt(values[0]))

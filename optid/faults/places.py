@@ -86,9 +86,8 @@ def matrices_of(label: str, word: str, given: Any, samples: range, healthy: Arra
     if not callable(given) and values.shape == (count, *healthy.shape):
         values = values[samples.start : samples.stop]
     if values.shape not in (healthy.shape, (len(samples), *healthy.shape)):
-        raise StructureError(
-            f"{label}: {word} has shape {values.shape}; it must be {healthy.shape}, or {(count, *healthy.shape)} "
-            "with one matrix for each sample.")
+        raise StructureError(f"{label}: {word} has shape {values.shape}; it must be {healthy.shape}, or "
+                             f"{(count, *healthy.shape)} with one matrix for each sample.")
     if not np.isfinite(values).all():
         raise StructureError(f"{label}: {word} has a value that is not finite.")
     return np.broadcast_to(values, (len(samples), *healthy.shape))

@@ -165,9 +165,8 @@ def unknown_effects(model: HammersteinSS, u: Array) -> tuple[Array, Array]:
     count, there = len(u), outside(model, u)
     total = sum(one.samples.size for one in there)
     if total > min(MOST, count // 2):
-        raise DataError(
-            f"{' '.join(map(str, there))} This part is too long to be left out: identify the "
-            "model over the wider range, or cut the record.")
+        raise DataError(f"{' '.join(map(str, there))} This part is too long to be left out: identify the model over "
+                        "the wider range, or cut the record.")
     into_state, into_output = np.zeros((count, model.nx, total)), np.zeros((count, model.l, total))
     for k, (sample, column) in enumerate((sample, one.column) for one in there for sample in one.samples):
         into_state[sample + 1 : sample + 2, :, k] = model.B[:, column]

@@ -55,16 +55,14 @@ def check_channels(model: HammersteinSS, data: Data) -> None:
         scale = np.where(np.arange(data.m) == c, 1 / factor, 1.0)
         trial = _energy(model, raw.map_signals(lambda u, s=scale: u * s, lambda y: y))
         if trial < BETTER * energy and trial < 2 * readings:
-            raise DataError(
-                f"Input {name!r} seems to be in another unit: the record fits the model when it is divided by "
-                f"{factor:g}. Convert it.")
+            raise DataError(f"Input {name!r} seems to be in another unit: the record fits the model when it is divided "
+                            f"by {factor:g}. Convert it.")
     for (number, part), (o, name) in product(enumerate(raw.experiments), enumerate(data.outputs)):
         found = _unit_jump(model, Data(part.u, part.y, raw.dt, raw.inputs, raw.outputs), o)
         if found is not None:
             where = f"experiment {number + 1}: " * (raw.n_experiments > 1)
-            raise DataError(
-                f"{where}the unit of output {name!r} seems to change at sample {found[0]}: from there on the readings "
-                f"fit the model when divided by {found[1]:g}. Convert them.")
+            raise DataError(f"{where}the unit of output {name!r} seems to change at sample {found[0]}: from there on "
+                            f"the readings fit the model when divided by {found[1]:g}. Convert them.")
 
 
 def check_causality(model: HammersteinSS, data: Data) -> None:

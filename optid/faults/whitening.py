@@ -108,9 +108,8 @@ def predictor(model: HammersteinSS) -> Predictor:
         raise StructureError("Every record of this model has its own level, which a fault of a sensor would pass "
                              "for: choose the level of the plant by model.at_level(constant).")
     if model.noise is None:
-        raise StructureError(
-            "The model has no noise covariances, which give the scale of its innovations: estimate them with "
-            "optid.noise.with_noise(model, data).")
+        raise StructureError("The model has no noise covariances, which give the scale of its innovations: estimate "
+                             "them with optid.noise.with_noise(model, data).")
     noise, failure = model.noise, ""
     for added in (0.0, ADDED):
         try:
@@ -176,9 +175,8 @@ def check_window(model: HammersteinSS, whitened: Whitened, what: str, onset: int
         DataError: other outputs than the model's, innovations that are not finite.
     """
     if not isinstance(whitened, Whitened):
-        raise StructureError(
-            f"{what} takes the whitened innovations of one experiment, as returned by optid.faults.whiten: pass the "
-            "experiments of a record one by one.")
+        raise StructureError(f"{what} takes the whitened innovations of one experiment, as returned by "
+                             "optid.faults.whiten: pass the experiments of a record one by one.")
     count, outputs = whitened.r.shape
     if outputs != model.l:
         raise DataError(f"The window has {outputs} outputs; the dictionary is of {model.l}.")

@@ -140,9 +140,8 @@ def search_record(record: Data, part: Experiment, found: Dictionary, asked: Ques
         white, least = whiten(found.model, alone, **noise), 2 * found.model.nx + 2
         seen = int(white.present.any(axis=1).sum())
         if seen < least:
-            raise DataError(
-                f"The record has {seen} samples with a reading (repeated readings of flat lines do not count): "
-                f"{found.model.nx} states require {least}.")
+            raise DataError(f"The record has {seen} samples with a reading (repeated readings of flat lines do not "
+                            f"count): {found.model.nx} states require {least}.")
         return white
 
     given, outliers = part, ()
@@ -167,17 +166,15 @@ def _limits(found: Dictionary, white: Whitened, u: Array, asked: Question) -> Th
     given, count = asked.thresholds, len(white.r)
     if given is not None:
         if given.window != count:
-            raise StructureError(
-                f"The thresholds are for windows of {given.window} samples; the record has {count}. Calibrate them "
-                f"with thresholds(faults, {count}, ...), or leave them out.")
+            raise StructureError(f"The thresholds are for windows of {given.window} samples; the record has {count}. "
+                                 f"Calibrate them with thresholds(faults, {count}, ...), or leave them out.")
         return given
     rate = asked.false_alarm * (1 - UNKNOWN_SHARE * found.unknown - COURSE_SHARE * any(without_signature(found)))
     needed = int(np.ceil(EXCEEDING / rate))
     if needed > MOST_DRAWS:
-        raise DataError(
-            f"false_alarm={asked.false_alarm:g}: thresholds for so rare an alarm need {needed} simulated windows; "
-            f"{MOST_DRAWS} are the most ({EXCEEDING / MOST_DRAWS:g} is the rarest alarm). Ask for a higher "
-            "probability, or simulate them yourself: thresholds(..., draws=...).")
+        raise DataError(f"false_alarm={asked.false_alarm:g}: thresholds for so rare an alarm need {needed} simulated "
+                        f"windows; {MOST_DRAWS} are the most ({EXCEEDING / MOST_DRAWS:g} is the rarest alarm). Ask for "
+                        "a higher probability, or simulate them yourself: thresholds(..., draws=...).")
     draws = max(needed, min(DRAWS, SIMULATED // count))
     inputs = u if any(c.columns or c.schedule is not None for c in found.candidates) else None
     return thresholds(found, white, rate, u=inputs, draws=draws, seed=asked.seed)

@@ -23,9 +23,8 @@ def plant_of(model: Any) -> tuple[HammersteinSS, Data | None]:
     fitted, data = getattr(model, "model", model), getattr(model, "data", None)
     if getattr(fitted, "kind", "") != "HammersteinSS":
         kind = getattr(fitted, "title", type(fitted).__name__)
-        raise StructureError(
-            f"A diagnosis requires a state-space model with noise covariances; this is a {kind}. Fit one, for example "
-            "with optid.fit(data, 'hammerstein_ss.asivid', nx=...).")
+        raise StructureError(f"A diagnosis requires a state-space model with noise covariances; this is a {kind}. Fit "
+                             "one, for example with optid.fit(data, 'hammerstein_ss.asivid', nx=...).")
     return fitted, data if isinstance(data, Data) else None
 
 
@@ -92,10 +91,9 @@ def uncertainty_of(model: HammersteinSS, data: Data | None, wanted: Any,
     if wanted not in (None, "use", "ignore"):
         raise StructureError(f"model_uncertainty={wanted!r}: it must be 'use', 'ignore' or a ModelUncertainty.")
     if wanted == "use" and data is None:
-        raise StructureError(
-            "model_uncertainty='use' requires the covariance of the model: pass the fit in place of the model, or "
-            "optid.faults.model_uncertainty(model, data) with the record it was identified from. 'ignore' takes the "
-            "model as exact.")
+        raise StructureError("model_uncertainty='use' requires the covariance of the model: pass the fit in place of "
+                             "the model, or optid.faults.model_uncertainty(model, data) with the record it was "
+                             "identified from. 'ignore' takes the model as exact.")
     if wanted == "ignore" or data is None:
         return None, ""
     found = model_uncertainty(model, data, decoupled=decoupled)

@@ -65,10 +65,9 @@ def calibrate(search: Window, f: Array, arl0: float, *, samples: int | None = No
     wanted = int(min(max(ALARMS * arl0, 200 * window), LONGEST)) if samples is None else int(samples)
     extrapolated = wanted < EXCEEDING * arl0
     if extrapolated and not extrapolate:
-        raise DataError(
-            f"{wanted} simulated samples cannot support a false alarm every {arl0:g}: {EXCEEDING} alarms are needed. "
-            f"Simulate {int(np.ceil(EXCEEDING * arl0))} samples (samples=), use a lower arl0, or extrapolate the tail "
-            "(extrapolate=True).")
+        raise DataError(f"{wanted} simulated samples cannot support a false alarm every {arl0:g}: {EXCEEDING} alarms "
+                        f"are needed. Simulate {int(np.ceil(EXCEEDING * arl0))} samples (samples=), use a lower arl0, "
+                        "or extrapolate the tail (extrapolate=True).")
     labels = tuple(c.label for c in columns.candidates)
     key = hashlib.sha256(repr((labels, float(arl0), seed, window, wanted)).encode())
     for part in (f, np.array([]) if effect is None else effect, columns.into_state, columns.into_output,

@@ -51,9 +51,8 @@ def atoms_of(found: Scan, limits: "Thresholds") -> tuple[Atoms, ...]:
     places = [np.flatnonzero(row) for row in found.tested]
     columns = sum(where.size * c.dimension for where, c in zip(places, found.dictionary.candidates))
     if columns * found.whitened.r.size > MOST:
-        raise StructureError(
-            f"{columns} columns of {found.whitened.r.size} readings are too many for a programme over all onsets: use "
-            "a shorter window, or scan fewer onsets (scan(..., onsets=...)).")
+        raise StructureError(f"{columns} columns of {found.whitened.r.size} readings are too many for a programme over "
+                             "all onsets: use a shorter window, or scan fewer onsets (scan(..., onsets=...)).")
     made = []
     for candidate, where, threshold in zip(found.dictionary.candidates, places, q):
         if not where.size:

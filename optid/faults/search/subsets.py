@@ -124,10 +124,9 @@ def best_subsets(scan: Scan, thresholds: "Thresholds", *, max_faults: int = 2,
     number = int(tested.sum())
     subsets = sum(comb(number, k) for k in range(1, max_faults + 1))
     if subsets > MOST:
-        raise StructureError(
-            f"{number} candidates and onsets make {subsets:.2g} subsets of up to {max_faults} faults: too many for an "
-            "exact search. Use fewer faults, a shorter window, or scan fewer onsets (scan(..., onsets=...)), such as "
-            "those near the active ones of the sparse method.")
+        raise StructureError(f"{number} candidates and onsets make {subsets:.2g} subsets of up to {max_faults} faults: "
+                             "too many for an exact search. Use fewer faults, a shorter window, or scan fewer onsets "
+                             "(scan(..., onsets=...)), such as those near the active ones of the sparse method.")
     columns, best, alike = _Columns.of(scan, q), _Best(), 0
     for size in range(1, min(max_faults, number) + 1):
         found = columns.best(size, tested)

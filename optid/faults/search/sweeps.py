@@ -187,9 +187,8 @@ def sweep(found: Dictionary, window: int | Whitened, u: Any = None) -> Sweep:
     if states is not None and len(states) != count and any(c.schedule for c in found.candidates):
         raise DataError(f"The states have {len(states)} samples; the window has {count}: cut them like the rest.")
     if not any(able):
-        raise StructureError(
-            "No candidate has a signature: add the kind 'bias', 'drift' or a state jump, or pass the input u for "
-            "losses and stuck actuators.")
+        raise StructureError("No candidate has a signature: add the kind 'bias', 'drift' or a state jump, or pass the "
+                             "input u for losses and stuck actuators.")
     driven = any(a and not c.additive for c, a in zip(found.candidates, able))
     if driven or white.nuisance is not None or not white.present.all():
         return _prepared(found, white, inputs, able)
