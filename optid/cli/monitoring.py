@@ -76,7 +76,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     from optid.data.reading.rows import RowReader
     from optid.errors import DataError
     from optid.faults import dictionary
-    from optid.faults.monitor.monitoring import KINDS_BY_DEFAULT
+    from optid.faults.diagnosis.diagnosing import KINDS
 
     if (ack or rebase or maintenance) and (state is None or not state.is_file()):
         raise DataError("--ack, --rebase and --maintenance go on from the state of a stopped monitor: name it with "
@@ -106,7 +106,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
                 if origin is None and sound is None and (thresholds is None or not thresholds.exists()):
                     origin = sound = _identified_from(model)
                 found = dictionary(
-                    plant, kinds=words.split_names(kinds) or list(KINDS_BY_DEFAULT), state_jump=state_jump,
+                    plant, kinds=words.split_names(kinds) or list(KINDS), state_jump=state_jump,
                     process=words.directions(load, "--process", plant),
                     disturbances=words.split_names(disturbance) or (),
                     zeros=words.pairs(words.split_names(zero), "--zero", ZERO, float))

@@ -13,7 +13,7 @@ from optid.errors import DataWarning, LookupFailed, StructureError, nearest
 from optid.faults.directions import decouple
 from optid.faults.faults import Fault
 from optid.faults.kinds import FaultKind, all_kinds, kind_of
-from optid.faults.places import channel_of, place_of
+from optid.faults.places import channel_of, functions_of, place_of
 from optid.faults.ranges import known_range
 from optid.faults.whitening import Predictor, predictor
 from optid.models import HammersteinSS
@@ -292,9 +292,7 @@ def candidate_of(model: HammersteinSS, name: str, kind: str, process: Mapping[st
     into_state, into_output = place_of(model, name, None, process)
     new = Candidate(name, kind, into_state, into_output, places=(name,))
     if new.fault_kind.driven and name.startswith("actuator"):
-        c = channel_of(model.inputs, name)
-        columns = tuple(i for i, of in enumerate(model.input_of) if of == c)
-        new = replace(new, columns=columns, zero=(zeros or {}).get(name.partition(":")[2]))
+        new = replace(new, columns=tuple(functions_of(model, name)), zero=(zeros or {}).get(name.partition(":")[2]))
     return replace(new, members=(new.own_label,))
 
 

@@ -9,20 +9,13 @@ import numpy as np
 from optid.data.record import Data
 from optid.data.timeline import Timeline
 from optid.errors import StructureError
+from optid.faults.diagnosis import records
 from optid.faults.diagnosis.alternatives import final_effect
 from optid.faults.diagnosis.answers import Certificate, Diagnosis, Estimate, FaultAnswer, SearchEvidence
 from optid.faults.diagnosis.courses import LONGEST
 from optid.faults.diagnosis.posterior import estimates
 from optid.faults.diagnosis.ranking import NOTHING, RankedExplanation, explain_record
 from optid.faults.diagnosis.record_search import Question, RecordSearch, search_record
-from optid.faults.diagnosis.records import (
-    lost_sensors,
-    plant_of,
-    record_of,
-    steady_predictor,
-    uncertainty_of,
-    without_lost_readings,
-)
 from optid.faults.false_alarms import Thresholds
 from optid.faults.nuisance import uncertain_start
 from optid.faults.ranges import input_range_notes, outside, usable_samples
@@ -74,12 +67,12 @@ def diagnose(model: Any, data: Any, faults: Dictionary | None = None, *, false_a
         StructureError: no noise covariances, impossible arguments, "use" without the covariance of the model.
     """
     asked = Question(false_alarm, max_faults, method, coverage, robust, thresholds, seed, solver)
-    plant, origin = plant_of(model)
-    record, found = record_of(plant, data), _dictionary(plant, faults)
-    steady, decoupled = steady_predictor(plant, healthy, rescale), None
+    plant, origin = records.plant_of(model)
+    record, found = records.record_of(plant, data), _dictionary(plant, faults)
+    steady, decoupled = records.steady_predictor(plant, healthy, rescale), None
     if found.predictor.silent:
         plant, decoupled = found.model, found.predictor
-    uncertainty, remark = uncertainty_of(plant, origin, model_uncertainty, decoupled)
+    uncertainty, remark = records.uncertainty_of(plant, origin, model_uncertainty, decoupled)
     if steady is None or decoupled is not None:  # an uncertain model has its own scale
         steady = found.predictor if uncertainty is None else uncertainty.predictor
     if steady is not found.predictor:
@@ -106,10 +99,10 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
           ) -> Diagnosis:
     """Return the diagnosis of an experiment; `noise` are arguments of `whiten`, and the remark is reported."""
     model = found.model
-    part, lines = without_lost_readings(record, number)
+    part, lines = records.without_lost_readings(record, number)
     count, cut = usable_samples(model, part.u)
     part = replace(part, u=part.u[:count], y=part.y[:count])
-    stuck = lost_sensors(lines, found, 2 * model.nx)
+    stuck = records.lost_sensors(lines, found, 2 * model.nx)
     first = search_record(record, part, found, asked, noise)
     notes = [remark, cut, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u)),
              *input_range_notes(model, part.u), *first.extrapolated]

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.faults.diagnosis.diagnosing import KINDS
 from optid.faults.false_alarms import Calibration, given_thresholds, raise_thresholds
 from optid.faults.monitor import file
 from optid.faults.monitor.actuator_kinds import searched
@@ -31,7 +32,6 @@ from optid.models import HammersteinSS
 from optid.models.experiments import state_like
 from optid.models.feedback_tables import tabulate
 
-KINDS_BY_DEFAULT = ("bias", "loss", "spike")
 NORMAL = 1.96  # standard deviations of the ends of a 95 % interval
 BLOCK = 4096  # samples searched at a time
 
@@ -88,7 +88,7 @@ class Monitor:
             DataWarning: candidates that a monitor cannot search for; a healthy record with other noise than the model;
                 a model whose parameters are not the most likely ones.
         """
-        found = dictionary(model, kinds=KINDS_BY_DEFAULT) if faults is None else faults
+        found = dictionary(model, kinds=KINDS) if faults is None else faults
         if not found.belongs_to(model):
             raise StructureError("faults: the dictionary belongs to another model; build it from this one.")
         least = 2 * model.nx + 2
