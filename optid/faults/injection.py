@@ -16,15 +16,10 @@ from optid.models.kalman import NoiseCovariances
 
 
 class Trajectory(NamedTuple):
-    """A simulated record of a plant with faults.
+    """A simulated record of a plant with faults."""
 
-    Attributes:
-        y: (N, l) readings.
-        x: (N, n) states.
-    """
-
-    y: Array
-    x: Array
+    y: Array  # (N, l) readings
+    x: Array  # (N, n) states
 
 
 class Surroundings(NamedTuple):

@@ -58,11 +58,7 @@ def place_of(model: HammersteinSS, name: str, direction: Any = None,
 
 
 def channel_of(names: tuple[str, ...], name: str) -> int:
-    """Return the index of the channel that the name of a fault ends in.
-
-    Raises:
-        LookupFailed: no such channel.
-    """
+    """Return the index of the channel that the name of a fault ends in; `LookupFailed`: no such channel."""
     channel = name.partition(":")[2]
     if channel not in names:
         raise LookupFailed(f"{name!r}: there is no channel {channel!r}. {nearest(channel, names)}")

@@ -34,10 +34,6 @@ def check_channels(model: HammersteinSS, data: Data) -> None:
     The criterion is the energy of the innovations: another order of the channels, or another factor of an output from
     some sample on (of an input in the whole record), makes it ten times smaller, and as large as the model predicts.
 
-    Args:
-        model: with noise covariances.
-        data: the record.
-
     Raises:
         DataError: swapped outputs or inputs; a change of the unit of an output, with sample and factor; an input in
             another unit, with the factor.

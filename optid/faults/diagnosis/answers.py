@@ -274,11 +274,7 @@ class Diagnosis(Rendered):
         return replace(found, best=found.candidates[int(content["best"])])
 
     def save(self, path: str | Path) -> Path:
-        """Write it to a JSON file without loss of precision.
-
-        Args:
-            path: the file, replaced when it exists.
-        """
+        """Write it to a JSON file, which is replaced when it exists, without loss of precision."""
         from optid.models.files import write
 
         return write(self.to_dict(), path, FORMAT, VERSION)
@@ -286,9 +282,6 @@ class Diagnosis(Rendered):
 
 def load_diagnosis(path: str | Path) -> Diagnosis:
     """Read a diagnosis from a file written by `Diagnosis.save`.
-
-    Args:
-        path: the file.
 
     Raises:
         FileNotFoundError: no such file.

@@ -72,33 +72,21 @@ class Scan:
         return float(np.sum(self.whitened.r**2))
 
     def index(self, candidate: Candidate | str) -> int:
-        """Return the row of a candidate.
-
-        Raises:
-            LookupFailed: no such candidate.
-        """
+        """Return the row of a candidate; `LookupFailed`: no such candidate."""
         c = self.dictionary[candidate] if isinstance(candidate, str) else candidate
         if here := [i for i, other in enumerate(self.dictionary.candidates) if other is c]:
             return here[0]
         raise LookupFailed(f"{c.label!r} is not in the dictionary. {nearest(c.label, self.labels)}")
 
     def peak(self, candidate: Candidate | str) -> int:
-        """Return the onset at which a candidate explains most.
-
-        Raises:
-            StructureError: a candidate that is tested nowhere.
-        """
+        """Return the onset at which a candidate explains most; `StructureError`: a candidate that is tested nowhere."""
         c = self.index(candidate)
         if np.isnan(self.statistic[c]).all():
             raise StructureError(f"{self.labels[c]} is tested at no onset of this window: it has no peak.")
         return int(np.nanargmax(self.statistic[c]))
 
     def estimate(self, candidate: Candidate | str, onset: int) -> Magnitude:
-        """Return the magnitudes of a candidate at an onset.
-
-        Raises:
-            StructureError: an onset at which it is not tested.
-        """
+        """Return the magnitudes of a candidate at an onset; `StructureError`: an onset at which it is not tested."""
         c = self.index(candidate)
         if not 0 <= onset < self.statistic.shape[1] or np.isnan(self.statistic[c, onset]):
             raise StructureError(f"{self.labels[c]} is not tested at onset {onset} of this window.")
