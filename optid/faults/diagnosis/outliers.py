@@ -34,7 +34,7 @@ def cleaned(found: Dictionary, part: Experiment,
         search = scan(wide, whitened, part.u)
         reading = _wildest(search)
         if reading is None:  # perhaps hidden by a fault
-            reading = _wildest(scan(wide, replace(whitened, r=whitened.r - _fitted(search)), part.u))
+            reading = _wildest(search.again(whitened.r - _fitted(search)))
         if reading is None:
             break
         taken.append(reading)
@@ -86,8 +86,8 @@ def _bounded(found: Dictionary, whitened: Whitened, u: Array) -> Scan:
             if _likeliest(rest)[2] < LIKELY:
                 break
             fitted = fitted + _fitted(rest)
-            rest = scan(found, replace(search.whitened, r=search.whitened.r - fitted), u)
-        search = scan(found, replace(whitened, r=fitted + np.clip(whitened.r - fitted, -BOUND, BOUND)), u)
+            rest = search.again(search.whitened.r - fitted)
+        search = search.again(fitted + np.clip(whitened.r - fitted, -BOUND, BOUND))
         if before is not None and np.allclose(fitted, before, atol=1e-3):
             break
         before = fitted

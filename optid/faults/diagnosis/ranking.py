@@ -194,7 +194,7 @@ def _fit(seen: RecordSearch, explanation: Explanation, probability: float) -> Ra
     rest = made.rest if explanation.error is None else explanation.error(made.rest)
     further, penalty, search, limits = 1.0, 0.0, seen.search, seen.limits
     if search is not None and limits is not None:
-        gains = search.sweep.statistic(search.sweep.correlations(rest)) - limits.q[:, None]
+        gains = search.again(rest).gains(limits)
         gains[np.isnan(seen.gains)] = np.nan
         further = further_fault(gains, limits.false_alarm)
         if explanation.search is search:

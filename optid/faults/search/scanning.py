@@ -4,7 +4,7 @@ Its thresholds are those of simulated healthy windows.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,6 +107,12 @@ class Scan:
         if not 0 <= onset < count:
             raise StructureError(f"onset={onset} lies outside the window of {count} samples.")
         return self.sweep.signature(c, onset)
+
+    def again(self, r: Array) -> "Scan":
+        """Return the search of other innovations (N, l) of the same window."""
+        correlations = self.sweep.correlations(r)
+        statistic = np.where(self.tested, self.sweep.statistic(correlations), np.nan)
+        return replace(self, whitened=replace(self.whitened, r=r), statistic=statistic, correlations=correlations)
 
     def together(self, labels: Sequence[Candidate | str], onsets: Sequence[int]) -> Magnitude:
         """Return the magnitudes of several candidates, one after the other, and their covariance."""
