@@ -5,7 +5,7 @@ from optid.lazy import on_first_use
 _HOME = {
     "faults": ["Fault"],
     "injection": ["inject", "trajectory", "Surroundings"],
-    "rank.hard_over": ["hard_over_test", "HardOver"],
+    "hard_over": ["hard_over_test", "HardOver"],
     "whitening": ["whiten", "health", "predictor"],
     "nuisance": ["model_uncertainty"],
     "directions": ["decouple", "direction_of"],
