@@ -17,7 +17,7 @@ one window later. Open loop is assumed: under feedback inputs depend on sensor n
 from dataclasses import dataclass, field, replace
 from functools import partial
 from textwrap import wrap
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,7 +247,8 @@ class _Tests:
             raise DataError(f"the model has channels {', '.join((*model.inputs, *model.outputs))}, the record others.")
         self.model, self.alpha, self.level = model, alpha, level
         self.input_of = range(healthy.m) if model is None else model.input_of
-        self.u, self.y = np.arange(len(self.input_of)), len(self.input_of) + np.arange(healthy.l)
+        self.u: Any = np.arange(len(self.input_of))
+        self.y: Any = len(self.input_of) + np.arange(healthy.l)
         self.sensors = [f"sensor:{c}" for c in healthy.outputs]
         self.actuators = [f"actuator:{c}" for c in healthy.inputs]
         statistics = hankel_statistics(self.signals(healthy), 3 * alpha, centre="mean")
@@ -279,8 +280,9 @@ class _Tests:
             statistics = hankel_statistics([record], 3 * self.alpha, centre="mean", method="gram")
             statistics.check()
         except RankError as error:
-            tests = (tuple(ZeroTest(name, healthy=0.0) for name in names) for names in (self.sensors, self.actuators))
-            return WindowVerdict(*place, None, str(error), float("nan"), *tests)
+            rows, columns = (tuple(ZeroTest(name, healthy=0.0) for name in names)
+                             for names in (self.sensors, self.actuators))
+            return WindowVerdict(*place, None, str(error), float("nan"), rows, columns)
         excitation = self.excitation(statistics) / self.excited
         order, least = None, 0
         note = f"untestable: smallest eigenvalue of the inputs {excitation:.1e} of the healthy one"

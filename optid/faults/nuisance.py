@@ -238,7 +238,7 @@ class Estimated(NamedTuple):
     moved: Array  # (p,) their deviation from the most likely ones
     deviation: float  # its size, in standard deviations
     scale: float  # of the innovations
-    sections: list[tuple[list[Array], list[Array]]]  # arguments of `overdispersion`, for both orders
+    sections: list[Any]  # pairs of arguments of `overdispersion`, for both orders
 
 
 def _gathered(every: ModelUncertainty, data: Data) -> Gathered:

@@ -57,7 +57,7 @@ class Decisions:
         self.labels = tuple(c.label for c in self.columns.candidates)
         self.groups = groups_of(self.columns.candidates)  # number of the first candidate of the group of each
         self.limits = Limits(np.full(len(self.labels), np.inf), self.rules)
-        self.spreads = np.ones(len(self.labels))  # (C,) factors of the variances of sizes: the model is uncertain
+        self.spreads: Array = np.ones(len(self.labels))  # (C,) factors of the variances of sizes
         self.testable = np.ones(len(self.labels), dtype=bool)  # (C,) whether a total loss is detectable
 
     def group(self, number: int) -> list[int]:
@@ -361,7 +361,7 @@ class Decisions:
 
     def _revise(self, now: int, owner: int, sizes: Array, covariance: Array) -> Event | None:
         """Return the event of a carried actuator whose kind has become clearer."""
-        before = self.undecided.get(owner)
+        before = self.undecided.get(owner, [])
         weights = self._weights(now, owner, sizes, covariance) if before else {}
         if not weights:
             return None

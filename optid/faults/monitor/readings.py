@@ -83,8 +83,8 @@ class ReadingChecks:
     def screen(self, u: Array, y: Array, start: int) -> Screened:
         """Check a block of inputs (T, m) and readings (T, l) that begins at the sample `start` of the stream."""
         outside, unsure = (np.asarray((u < low) | (u > high)) for low, high in (self.known, self.usable))
-        away, blind = np.hstack([distance(u, self.known), distance(y, self.levels)]), np.isnan(u).any(axis=1)
-        far = away > BEYOND
+        away = np.hstack([distance(u, self.known), distance(y, self.levels)])
+        blind, far = np.asarray(np.isnan(u).any(axis=1)), away > BEYOND
         far[:, : u.shape[1]] &= unsure  # a linear function of an input is extrapolated further
         self._follow(np.hstack([u, y]), far, start)
         clean, repeating, findings = self.sensors.screen(y, blind, start)
