@@ -20,7 +20,7 @@ from scipy.stats import chi2
 import optid
 from optid import Data
 from optid.faults import Fault, HardOver, hard_over_test, inject
-from optid.faults.rank.hard_over import BLOCK_ROWS
+from optid.faults.hard_over import BLOCK_ROWS
 from optid.plants import two_mode_plant
 
 N = 1500

@@ -21,10 +21,9 @@ from optid.core.group_sparse import group_squares
 from optid.core.problem import Problem
 from optid.core.terms import GroupNorms
 from optid.errors import StructureError
-from optid.faults.search.atoms import Atoms, atoms_of
-from optid.faults.search.calibration import Thresholds
+from optid.faults.false_alarms import Thresholds
 from optid.faults.search.scanning import Scan
-from optid.faults.search.sparse import SparseResult
+from optid.faults.search.sparse import Atoms, SparseResult, atoms_of
 from optid.solving.solve import Evidence, Procedure
 
 

@@ -8,7 +8,7 @@ import time as clock
 from collections.abc import Iterator
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from optid.cli.faults import ZERO
 from optid.cli.options import READING, File, Paths, Words
@@ -20,19 +20,13 @@ if TYPE_CHECKING:
     from optid.cli.state_file import StateFile
 
 LOUD = 20  # unreadable rows reported individually per block read; the others are counted
-
-ARL0 = 10_000
-"""Default mean number of samples between false alarms."""
-
+ARL0 = 10_000  # default mean number of samples between false alarms
 HOUR = 3600.0  # seconds
-
 REMEMBERED = 1000  # samples whose time stamps are kept, for the time of an onset
+RETRY = 10.0  # seconds until a failed write is tried again, events or not
+KEPT = 10_000  # samples after which the state is saved, events or not
 
 Part = tuple[list[bytes], str]  # lines, and a remark where another file begins
-
-RETRY = 10.0  # seconds until a failed write is tried again, events or not
-
-KEPT = 10_000  # samples after which the state is saved, events or not
 
 
 def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: dict[str, Any],
@@ -82,7 +76,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     from optid.data.reading.rows import RowReader
     from optid.errors import DataError
     from optid.faults import dictionary
-    from optid.faults.monitor.monitoring import KINDS_BY_DEFAULT
+    from optid.faults.diagnosis.diagnosing import KINDS
 
     if (ack or rebase or maintenance) and (state is None or not state.is_file()):
         raise DataError("--ack, --rebase and --maintenance go on from the state of a stopped monitor: name it with "
@@ -112,7 +106,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
                 if origin is None and sound is None and (thresholds is None or not thresholds.exists()):
                     origin = sound = _identified_from(model)
                 found = dictionary(
-                    plant, kinds=words.split_names(kinds) or list(KINDS_BY_DEFAULT), state_jump=state_jump,
+                    plant, kinds=words.split_names(kinds) or list(KINDS), state_jump=state_jump,
                     process=words.directions(load, "--process", plant),
                     disturbances=words.split_names(disturbance) or (),
                     zeros=words.pairs(words.split_names(zero), "--zero", ZERO, float))
@@ -127,7 +121,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
         for sentence in heard:
             note(sentence)
         watcher.source = watcher.source or {"model": plant.to_dict()}
-        _Watch(watcher, reader, follow, kept, _Habits(strict, lines, maintenance)).run(until_end)
+        _Watch(watcher, reader, follow, kept, as_json=lines, skips=maintenance).run(until_end, strict)
 
 
 def _identified_from(path: Path) -> Any:
@@ -233,27 +227,23 @@ class _Signals:
             yield part
 
 
-class _Habits(NamedTuple):
-    strict: bool  # whether a bad row ends it
-    as_json: bool  # whether events are lines of JSON
-    skips: bool  # whether rows are passed by, as under maintenance
-
-
 class _Watch:
     """Reads the stream, runs the monitor and prints its events.
 
     Position of the stream, state of the monitor and counts belong together: they change while a block is processed and
     are saved between blocks only. The saved state is replaced right after its last events have been printed: a process
     that is killed just between the two prints these once more.
+
+    With `as_json` events are lines of JSON; with `skips` rows pass by, as under maintenance.
     """
 
-    def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: "StateFile | None", habits: _Habits
-                 ) -> None:
+    def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: "StateFile | None", *,
+                 as_json: bool = False, skips: bool = False) -> None:
         from optid.cli.following import Followed
         from optid.errors import DataError
 
         self.watcher, self.reader, self.state, source = watcher, reader, state, watcher.source or {}
-        self.strict, self.as_json, self.skips = habits
+        self.as_json, self.skips, self.strict = as_json, skips, False
         self.plant = source.get("model")
         self.bad, self.saved, self.place = source.get("bad", 0), watcher.samples, source.get("place")
         self.stamps = {int(sample): stamp for sample, stamp in source.get("stamps", [])}
@@ -266,9 +256,11 @@ class _Watch:
             reader.resume(source)
         self.file = None if follow is None else Followed(follow, self.place)
 
-    def run(self, until_end: bool) -> None:
+    def run(self, until_end: bool, strict: bool = False) -> None:
+        """Read to the end of the stream, or of the file where asked; a bad row ends it where that is strict."""
         from optid.cli.following import standard_input
 
+        self.strict = strict
         # with a state the last line may still be completed, so that it is read by the next run
         parts = standard_input() if self.file is None else self.file.lines(until_end, partial=self.state is None)
         with _Signals() as signals:
@@ -365,7 +357,7 @@ class _Watch:
         if self.as_json:
             text = json.dumps({**event.to_dict(), "line": line, "time": stamp, "onset_time": onset})
         else:
-            text = f"sample {event.in_words(_in_words(stamp), _in_words(onset))}"
+            text = f"sample {event.in_words(*(_clean(time, 't = ') if time else '' for time in (stamp, onset)))}"
         self.lines.append(text + "\n")
 
 
@@ -375,19 +367,9 @@ def _note(text: str) -> None:
         note(text)
 
 
-def _in_words(stamp: str | None) -> str:
-    """Return a time stamp as text that can stand alone; "" without one."""
-    if stamp is None:
-        return ""
+def _clean(stamp: str, word: str = "") -> str:
+    """Return a time stamp without the rounding errors of accumulated sampling times, a number after a word."""
     try:
-        return f"t = {float(stamp):.12g}"
-    except ValueError:
-        return stamp
-
-
-def _clean(stamp: str) -> str:
-    """Return a time stamp without the rounding errors of accumulated sampling times."""
-    try:
-        return f"{float(stamp):.12g}"
+        return f"{word}{float(stamp):.12g}"
     except ValueError:
         return stamp

@@ -20,16 +20,11 @@ from optid.faults.whitening import Predictor
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """The products, of signals relative to their ranges in the record of identification.
+    """The products, of signals relative to their ranges in the record of identification."""
 
-    Attributes:
-        low, high: (m + l,) lowest and highest inputs and outputs.
-        inputs: number m of inputs.
-    """
-
-    low: Array
-    high: Array
-    inputs: int
+    low: Array  # (m + l,) lowest inputs and outputs
+    high: Array  # (m + l,) highest ones
+    inputs: int  # number m of inputs
 
     @classmethod
     def of(cls, parts: Sequence[Experiment]) -> "Products":

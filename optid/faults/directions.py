@@ -9,7 +9,7 @@ plant without d, whatever its course.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,23 +18,17 @@ from optid.arrays import Array
 from optid.errors import LookupFailed, StructureError, nearest
 from optid.faults.places import place_of
 from optid.faults.whitening import Predictor, predictor
+from optid.models import HammersteinSS
 
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
-
-UNLIMITED = 1e5
-"""Standard deviation of a disturbance, relative to those of the innovations that it affects."""
-
-ROUND = 1e-6
-"""Isotropic covariance added to the process noise, relative to its trace."""
+UNLIMITED = 1e5  # standard deviation of a disturbance, relative to those of the innovations that it affects
+ROUND = 1e-6  # isotropic covariance added to the process noise, relative to its trace
 
 GENERIC = np.exp(0.7j) * 1.3
 """Point of the z plane at which the rank of the transfer matrix from disturbances to outputs is computed."""
 
 
-def decouple(
-    model: "HammersteinSS", disturbances: Sequence[str], process: Mapping[str, ArrayLike] | None = None
-) -> tuple["HammersteinSS", Predictor]:
+def decouple(model: HammersteinSS, disturbances: Sequence[str],
+             process: Mapping[str, ArrayLike] | None = None) -> tuple[HammersteinSS, Predictor]:
     """Return a model whose noise includes disturbances of any course, and the predictor decoupled from them.
 
     Args:
@@ -68,8 +62,7 @@ def decouple(
     if silent >= model.l:
         raise StructureError(
             f"The disturbances {', '.join(disturbances)} of any course cover all outputs ({', '.join(model.outputs)}): "
-            "nothing is left to judge. Declare fewer of them, or add a sensor."
-        )
+            "nothing is left to judge. Declare fewer of them, or add a sensor.")
     assert model.noise is not None
     E, F, noise = UNLIMITED * E / sizes, UNLIMITED * F / sizes, model.noise
     louder = replace(model, noise=replace(noise, Q=noise.Q + E @ E.T, R=noise.R + F @ F.T, S=noise.S + E @ F.T))
@@ -81,7 +74,7 @@ def decouple(
     return louder, replace(loud, root=np.ascontiguousarray(r[::-1, ::-1]), silent=silent)
 
 
-def direction_of(model: "HammersteinSS", outputs: Mapping[str, float]) -> Array:
+def direction_of(model: HammersteinSS, outputs: Mapping[str, float]) -> Array:
     """Return the direction (n,) in the state equation that changes the outputs by given amounts within one sample.
 
     With more states than outputs it is not unique; returned is the most probable one under the process noise,

@@ -58,10 +58,8 @@ class Fault:
             raise StructureError(f"{self.name}: {error}") from None
         possible = (*self.fault_kind.places, *self.fault_kind.simulated)
         if self.place not in possible:
-            raise StructureError(
-                f"{self.name!r} cannot have a fault of kind {self.kind!r}: "
-                f"its name begins with {' or '.join(map(repr, possible))}, as in 'actuator:u1'."
-            )
+            raise StructureError(f"{self.name!r} cannot have a fault of kind {self.kind!r}: its name begins with "
+                                 f"{' or '.join(map(repr, possible))}, as in 'actuator:u1'.")
         for word, value in (("onset", self.onset), ("end", self.end)):
             if value is not None and (value != int(value) or value < 0):
                 raise StructureError(f"{self.name}: {word} = {value!r}; it must be a nonnegative integer.")
@@ -100,9 +98,8 @@ class Fault:
         return slice(int(self.onset), count if self.end is None else min(int(self.end), count))
 
     @classmethod
-    def step(
-        cls, name: str, onset: int, size: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
-    ) -> "Fault":
+    def step(cls, name: str, onset: int, size: ArrayLike, *, end: int | None = None,
+             direction: ArrayLike | None = None) -> "Fault":
         """Return a constant offset from the onset on, (1.8) and (1.9).
 
         Args:
@@ -123,9 +120,8 @@ class Fault:
         return cls(name, kind, onset, None, _finite(name, size, "size"), _finite(name, direction, "direction"))
 
     @classmethod
-    def ramp(
-        cls, name: str, onset: int, slope: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
-    ) -> "Fault":
+    def ramp(cls, name: str, onset: int, slope: ArrayLike, *, end: int | None = None,
+             direction: ArrayLike | None = None) -> "Fault":
         """Return a drift: slope at the onset, twice the slope one sample later, .... Arguments as `step`."""
         return cls(name, "drift", onset, end, _finite(name, slope, "size"), _finite(name, direction, "direction"))
 
@@ -170,10 +166,9 @@ class Fault:
         return cls(name, "hard_over", onset, end, None if value is None else float(_finite(name, value, "value")))
 
     @classmethod
-    def process_noise(
-        cls, name: str, onset: int, *, std: float | None = None, scale: float | None = None,
-        covariance: ArrayLike | None = None, end: int | None = None, direction: ArrayLike | None = None,
-    ) -> "Fault":
+    def process_noise(cls, name: str, onset: int, *, std: float | None = None, scale: float | None = None,
+                      covariance: ArrayLike | None = None, end: int | None = None,
+                      direction: ArrayLike | None = None) -> "Fault":
         """Return additional white noise in the state equation, (1.12).
 
         The name is "process:load" along a direction, or "process" in all states. Give one (`StructureError`) of std,
@@ -184,10 +179,8 @@ class Fault:
                    *_noise(name, std, scale, covariance))
 
     @classmethod
-    def sensor_noise(
-        cls, name: str, onset: int, *, std: float | None = None, scale: float | None = None,
-        covariance: ArrayLike | None = None, end: int | None = None,
-    ) -> "Fault":
+    def sensor_noise(cls, name: str, onset: int, *, std: float | None = None, scale: float | None = None,
+                     covariance: ArrayLike | None = None, end: int | None = None) -> "Fault":
         """Return additional white noise of a sensor, (1.13); "sensor" alone is all of them. As `process_noise`."""
         return cls(name, "noise", onset, end, None, None, 0.0, *_noise(name, std, scale, covariance))
 

@@ -1,7 +1,7 @@
 """The signals of a simulated plant with faults; every kind of fault changes them in its own way."""
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,10 +9,8 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.errors import StructureError
 from optid.faults.places import channel_of, functions_of, matrices_of, place_of
+from optid.models import HammersteinSS
 from optid.models.kalman import NoiseCovariances
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 
 class Sensors(NamedTuple):
@@ -52,7 +50,7 @@ class FaultyPlant:
         stream: random numbers of its own.
     """
 
-    def __init__(self, model: "HammersteinSS", u: Array, present: NoiseCovariances | None,
+    def __init__(self, model: HammersteinSS, u: Array, present: NoiseCovariances | None,
                  process: Mapping[str, ArrayLike], healthy: np.random.Generator) -> None:
         """Set up a plant without faults, whose noise is drawn from `healthy`."""
         count, n, l = len(u), model.nx, model.l  # noqa: E741
@@ -78,10 +76,8 @@ class FaultyPlant:
         into_state, into_output = place_of(self.model, name, direction, self.process)
         size = np.asarray(size)
         if size.shape != (into_state.shape[1],):
-            raise StructureError(
-                f"{name}: size of shape {size.shape}; this place has {into_state.shape[1]} columns: give one entry "
-                "for each."
-            )
+            raise StructureError(f"{name}: size of shape {size.shape}; this place has {into_state.shape[1]} columns: "
+                                 "give one entry for each.")
         added = np.zeros(len(self.jolt))
         added[self.now] = course(np.arange(self.now.stop - self.now.start))
         if name.startswith("actuator:"):  # through B(k), which may be scheduled

@@ -1,7 +1,7 @@
 """Simulation of a plant with faults."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,23 +10,16 @@ from optid.arrays import Array, compact, one_or_all
 from optid.errors import DataError, StructureError
 from optid.faults.faults import Fault
 from optid.faults.faulty_plant import FaultyPlant
+from optid.models import HammersteinSS
 from optid.models.experiments import check_inputs, records_of, state_like
 from optid.models.kalman import NoiseCovariances
 
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
-
 
 class Trajectory(NamedTuple):
-    """A simulated record of a plant with faults.
+    """A simulated record of a plant with faults."""
 
-    Attributes:
-        y: (N, l) readings.
-        x: (N, n) states.
-    """
-
-    y: Array
-    x: Array
+    y: Array  # (N, l) readings
+    x: Array  # (N, n) states
 
 
 class Surroundings(NamedTuple):
@@ -38,10 +31,9 @@ class Surroundings(NamedTuple):
     feedback: str = "measured"
 
 
-def inject(
-    model: "HammersteinSS", u: Any, faults: Fault | Sequence[Fault] = (), *, seed: int | None = 0, x0: Any = "zero",
-    noise: NoiseCovariances | str = "model", process: Mapping[str, ArrayLike] | None = None, feedback: str = "measured",
-) -> Any:
+def inject(model: HammersteinSS, u: Any, faults: Fault | Sequence[Fault] = (), *, seed: int | None = 0,
+           x0: Any = "zero", noise: NoiseCovariances | str = "model", process: Mapping[str, ArrayLike] | None = None,
+           feedback: str = "measured") -> Any:
     """Simulate a plant with one or several faults.
 
     The noise of the healthy plant is the same with and without faults for the same seed. Losses and stuck actuators act
@@ -71,14 +63,11 @@ def inject(
     seeds = np.random.SeedSequence(seed).spawn(len(records)) if len(records) > 1 else [seed]
     return one_or_all([
         trajectory(model, inputs, faults, seed=own, surroundings=surroundings).y
-        for (inputs, _, _), own in zip(records, seeds)
-    ])
+        for (inputs, _, _), own in zip(records, seeds)])
 
 
-def trajectory(
-    model: "HammersteinSS", u: ArrayLike, faults: Fault | Sequence[Fault] = (), *, seed: Any = 0,
-    surroundings: Surroundings | None = None,
-) -> Trajectory:
+def trajectory(model: HammersteinSS, u: ArrayLike, faults: Fault | Sequence[Fault] = (), *, seed: Any = 0,
+               surroundings: Surroundings | None = None) -> Trajectory:
     """Simulate one record as `inject` does and return the states, too."""
     from optid.faults.kernels import march_faulty
     from optid.models.state_kernels import INSIDE, REFUSED
@@ -88,8 +77,7 @@ def trajectory(
         raise StructureError(f"feedback={feedback!r}: use 'measured' or 'true'.")
     if not model.parts.tables.compiled:
         raise StructureError(
-            "The feedback has functions of the user, which cannot be compiled. Fit them by another basis first."
-        )
+            "The feedback has functions of the user, which cannot be compiled. Fit them by another basis first.")
     inputs = records_of(model, [np.asarray(u)])[0][0][0]
     check_inputs(model, inputs, "")
     broken = [faults] if isinstance(faults, Fault) else list(faults)
@@ -103,15 +91,12 @@ def trajectory(
     if ended != INSIDE:
         raise DataError(
             f"At sample {at} the output leaves the interval of a feedback basis with outside='error'."
-            if ended == REFUSED else f"The faulty plant leaves the range of numbers at sample {at}: it is unstable."
-        )
+            if ended == REFUSED else f"The faulty plant leaves the range of numbers at sample {at}: it is unstable.")
     return Trajectory(readings, states)
 
 
-def _broken(
-    model: "HammersteinSS", u: Array, faults: list[Fault], covariances: NoiseCovariances | None, seed: Any,
-    process: Mapping[str, ArrayLike],
-) -> FaultyPlant:
+def _broken(model: HammersteinSS, u: Array, faults: list[Fault], covariances: NoiseCovariances | None, seed: Any,
+            process: Mapping[str, ArrayLike]) -> FaultyPlant:
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     healthy, *streams = (np.random.default_rng(s) for s in root.spawn(len(faults) + 1))
     plant = FaultyPlant(model, u, covariances, process, healthy)
@@ -120,7 +105,7 @@ def _broken(
     return plant
 
 
-def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> NoiseCovariances | None:
+def _covariances(model: HammersteinSS, noise: NoiseCovariances | str) -> NoiseCovariances | None:
     if isinstance(noise, NoiseCovariances):
         if noise.S.shape != (model.nx, model.l):
             raise StructureError(f"noise: S has shape {noise.S.shape}; it must be {(model.nx, model.l)}.")
@@ -130,14 +115,12 @@ def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> Noise
     if noise != "model":
         raise StructureError(f"noise={noise!r}: use 'model', 'none' or NoiseCovariances.")
     if model.noise is None:
-        raise StructureError(
-            "The model has no noise covariances: estimate them with optid.noise.with_noise(model, data), or pass "
-            "noise='none' for a run without noise."
-        )
+        raise StructureError("The model has no noise covariances: estimate them with optid.noise.with_noise(model, "
+                             "data), or pass noise='none' for a run without noise.")
     return model.noise
 
 
-def _started(model: "HammersteinSS", x0: Any, u: Array) -> Array:
+def _started(model: HammersteinSS, x0: Any, u: Array) -> Array:
     if not isinstance(x0, str):
         return np.array(state_like(x0, (model.nx,)))
     if x0 == "zero":

@@ -14,31 +14,24 @@ from scipy.special import ndtr, ndtri
 
 from optid.arrays import Array, check_integer
 from optid.errors import DataError, LookupFailed, StructureError, nearest
-from optid.faults.search.calibration import check_draws, family_thresholds
+from optid.faults.false_alarms import check_draws, family_thresholds
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Dictionary
 from optid.registry import Rendered
 
-GRID = np.concatenate([[0.0], np.geomspace(0.5, 600.0, 72)])
-"""Deflections at which the probabilities are computed."""
+GRID = np.concatenate([[0.0], np.geomspace(0.5, 600.0, 72)])  # deflections at which the probabilities are computed
 
 NUMBERS = 200_000_000
 """Numbers in the simulated windows of one fault above which a study is refused, because of the memory."""
 
-MIDDLE = 0.3, 0.7
-"""Range of a random onset, as shares of the window."""
+MIDDLE = 0.3, 0.7  # range of a random onset, as shares of the window
 
 
 class Forecast(NamedTuple):
-    """Probabilities of detection and isolation of a fault of a given size.
+    """Probabilities of detection and isolation of a fault of a given size."""
 
-    Attributes:
-        detected: probability of an alarm.
-        isolated: probability of an alarm with the right candidate.
-    """
-
-    detected: float
-    isolated: float
+    detected: float  # probability of an alarm
+    isolated: float  # probability of an alarm with the right candidate
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -111,11 +104,9 @@ class Isolability(Rendered):
         return [tuple(label.split(" | ")) for label in self.labels if " | " in label]
 
 
-def isolability(
-    found: Dictionary, window: int = 100, *, onset: int | str = "unknown", prob: float = 0.95,
-    false_alarm: float = 0.01, draws: int = 1000, calibration: int = 20_000, seed: int | None = 0,
-    u: ArrayLike | None = None,
-) -> Isolability:
+def isolability(found: Dictionary, window: int = 100, *, onset: int | str = "unknown", prob: float = 0.95,
+                false_alarm: float = 0.01, draws: int = 1000, calibration: int = 20_000, seed: int | None = 0,
+                u: ArrayLike | None = None) -> Isolability:
     """Return the smallest detectable and isolable size of every fault, by simulating the search for it at all sizes.
 
     Args:
@@ -139,10 +130,8 @@ def isolability(
         check_integer(value, word)
     check_integer(seed, "seed", 0, 2**63)
     if window * found.model.l * draws > NUMBERS:
-        raise StructureError(
-            f"window={window}: {draws} simulated windows of this length do not fit in memory: use at most "
-            f"{NUMBERS // (found.model.l * draws)} samples, or fewer draws."
-        )
+        raise StructureError(f"window={window}: {draws} simulated windows of this length do not fit in memory: use at "
+                             f"most {NUMBERS // (found.model.l * draws)} samples, or fewer draws.")
     if not 0.5 <= prob < 1:
         raise StructureError(f"prob={prob!r}; it must be a probability from 0.5 to below 1.")
     if isinstance(onset, str) and onset != "unknown":
@@ -193,9 +182,8 @@ def _scores(space: Sweep, windows: Array) -> list[Array]:
     return [space.coordinates(found, int(c))[:, space.tested[c]] for c in np.flatnonzero(space.tables.sizes)]
 
 
-def _curves(
-    space: Sweep, place: int, noise: list[Array], thresholds: Array, known: int | None, rng: np.random.Generator
-) -> tuple[Array, Array, Array, Array, float]:
+def _curves(space: Sweep, place: int, noise: list[Array], thresholds: Array, known: int | None,
+            rng: np.random.Generator) -> tuple[Array, Array, Array, Array, float]:
     """Probabilities of one fault over the grid of deflections, and the deflection of a size of one.
 
     They are those of detection (G,), of isolation (G,), of detection and preference to each other candidate (C, G), in
@@ -221,22 +209,18 @@ def _curves(
         own = excess[:, [place]]
         preferred[:, g] = np.mean((own > 0) & (own >= excess), axis=0)
         preferred[place, g] = detected[g]
-        accused[:, g] = [np.mean(alarm & (answer == j)) for j in range(count)]
+        accused[:, g] = np.bincount(answer[alarm], minlength=count) / draws
     return detected, isolated, preferred, accused, unit
 
 
-def _directions(
-    space: Sweep, c: int, known: int | None, draws: int, rng: np.random.Generator
-) -> tuple[Array, float]:
+def _directions(space: Sweep, c: int, known: int | None, draws: int, rng: np.random.Generator) -> tuple[Array, float]:
     """Return sizes (M, d) of deflection one in mid-window, in random directions, and the deflection of a unit size."""
     onset = space.window // 2 if known is None else known
     trace = space.signature(c, onset)
     values, axes = np.linalg.eigh(np.einsum("kop,koq->pq", trace, trace))
     if not values[-1] > 0:
-        raise DataError(
-            f"{space.found.labels[c]}: untestable, the input does not excite it after sample {onset}. Use a window in "
-            "which it moves."
-        )
+        raise DataError(f"{space.found.labels[c]}: untestable, the input does not excite it after sample {onset}. Use "
+                        "a window in which it moves.")
     d = values.size
     if d == 1:
         unit = float(np.sqrt(values[0]))

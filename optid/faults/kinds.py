@@ -23,8 +23,7 @@ GROUP = "optid.fault_kinds"
 LASTING, DRIFT, JUMP, DRIVEN = range(4)
 """The course of a column after its onset, as the kernels know it: 1 1 1 .., 1 2 3 .., 1 0 0 .., or driven by inputs."""
 
-Additions = tuple[Array, Array]
-"""What a fault adds to the state (N, n, d) and to the output (N, l, d)."""
+Additions = tuple[Array, Array]  # what a fault adds to the state (N, n, d) and to the output (N, l, d)
 
 
 @dataclass(frozen=True)

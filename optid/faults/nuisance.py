@@ -33,7 +33,7 @@ it is multiplied by d^2.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,82 +42,53 @@ from optid.data.record import Data, Experiment
 from optid.data.stretches import interpolate_missing
 from optid.errors import DataError
 from optid.faults.curvature import Products
-from optid.faults.ranges import outside, unknown_effects
+from optid.faults.false_alarms import CONFIDENCE
+from optid.faults.ranges import BEYOND, distance, outside, unknown_effects
 from optid.faults.screening import check_causality
 from optid.faults.whitening import Nuisance, Predictor, predictor, whiten
+from optid.models import HammersteinSS
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
 
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
-
 MATRICES = ("A", "B", "C", "D", "E", "L", "K", "offset_x", "offset_y")
 
-STEP = 1e-5
-"""Step of the central differences, relative to the parameter and to the size of its matrix."""
-
-KNOWN = 1e-12
-"""Share of the largest information below which a direction changes no prediction."""
-
-CONFIDENCE = 0.95
-"""Of the upper bound of the factor of the covariance from a healthy record."""
-
-FACTORS = 1.0, 1000.0, 300
-"""The smallest factor, the largest, and their number."""
-
-SECTIONS = 10
-"""Sections of the record of identification between which the parameters may vary."""
-
-SMOOTHED = 5
-"""Samples over which the operating point is averaged."""
-
-REJECTED = 3.0
-"""Standard deviations of the score at which equal parameters of all sections are rejected."""
-
-LARGEST, OFTEN = 100, 10
-"""Largest number of coefficients of products, and fewest samples for each parameter with them."""
-
-ITERATIONS = 30
-"""Iterations of the estimate of their variation."""
-
-BEYOND = 1.1
-"""Distance of the readings from the middle of their range, in half ranges, from which the model extrapolates."""
-
-DRAWS = 4000
-"""Simulated energies behind the bound of the factor."""
-
-DIFFUSE = 1e6
-"""Standard deviation of an unknown initial state, relative to its effect."""
+STEP = 1e-5  # step of the central differences, relative to the parameter and to the size of its matrix
+KNOWN = 1e-12  # share of the largest information below which a direction changes no prediction
+FACTORS = 1.0, 1000.0, 300  # the smallest factor, the largest, and their number
+SECTIONS = 10  # sections of the record of identification between which the parameters may vary
+SMOOTHED = 5  # samples over which the operating point is averaged
+REJECTED = 3.0  # standard deviations of the score at which equal parameters of all sections are rejected
+LARGEST, OFTEN = 100, 10  # largest number of coefficients of products, and fewest samples for each parameter with them
+ITERATIONS = 30  # iterations of the estimate of their variation
+DRAWS = 4000  # simulated energies behind the bound of the factor
+DIFFUSE = 1e6  # standard deviation of an unknown initial state, relative to its effect
 
 
 @dataclass(frozen=True, eq=False)
 class ModelUncertainty:
-    """The covariance of the parameters of an identified model.
+    """The covariance of the parameters of an identified model."""
 
-    Attributes:
-        model: the model, with the gain of the predictor.
-        predictor: of the noise with the corrections for a short record; used for windows.
-        root: (parameters, q) with covariance root root'.
-        readings: number of readings behind it, less one for each initial state estimated.
-        inflation: factor of the covariance, from a healthy record or from the sections of the identification.
-        levels: (2, l) lowest and highest readings of the identification; None for a model that is exact.
-        deviation: of the parameters from the most likely ones, in standard deviations; 0 where it is not significant.
-        curvature: the products whose coefficients are the last parameters; None where they are zero.
-    """
-
-    model: "HammersteinSS"
-    predictor: Predictor
-    root: Array
-    readings: int
-    inflation: float = 1.0
+    model: "HammersteinSS"  # the model, with the gain of the predictor
+    predictor: Predictor  # of the noise with the corrections for a short record; used for windows
+    root: Array  # (parameters, q) with covariance root root'
+    readings: int  # number of readings behind it, less one for each initial state estimated
+    inflation: float = 1.0  # factor of the covariance, from a healthy record or from the sections of the identification
+    # (2, l) lowest and highest readings of the identification; None for a model that is exact
     levels: Array | None = None
+    # of the parameters from the most likely ones, in standard deviations; 0 where it is not significant
     deviation: float = 0.0
+    # the products whose coefficients are the last parameters; None where they are zero
     curvature: Products | None = None
 
     @cached_property
-    def moves(self) -> "list[tuple[HammersteinSS, HammersteinSS, float]]":
-        """Two models beside the model along every column of root, and the factor of their difference."""
-        return list(moved_models(self.model, self.root))
+    def moves(self) -> list[tuple[HammersteinSS, HammersteinSS, float]]:
+        """Two models on both sides along every column of root, and the factor of their difference."""
+        theta, steps, back = parameters(self.model)
+        root = self.root[: len(theta)]  # those of the model
+        largest = np.abs(root / steps[:, None]).max(axis=0, initial=0.0)
+        largest[largest == 0] = 1.0
+        return [(back(theta + column / size), back(theta - column / size), float(size / 2))
+                for column, size in zip(root.T, largest)]  # no parameter moves by more than its step
 
     @property
     def remark(self) -> str:
@@ -138,11 +109,7 @@ class ModelUncertainty:
         """
         from scipy.ndimage import minimum_filter1d
 
-        if self.levels is None:
-            return np.ones(y.shape)
-        low, high = self.levels
-        span = np.where(high > low, high - low, np.inf)  # one reading only is no range
-        return minimum_filter1d(np.fmax(np.abs(2 * y - low - high) / span, 1.0), 3, axis=0, mode="nearest")
+        return minimum_filter1d(distance(y, self.levels), 3, axis=0, mode="nearest")
 
     def output_range_notes(self, y: Array) -> list[str]:
         """State the outputs whose readings (N, l) leave the range they were identified over, and since when."""
@@ -157,18 +124,31 @@ class ModelUncertainty:
 
     def sensitivities(self, part: Experiment, x0: Array, present: Array) -> tuple[Array, Array]:
         """Derivatives (N, l, q) and (N, l, n) of the innovations along the columns of root and by the start."""
-        return sensitivities(self.model, self.predictor, part, x0, present, self.root, self.curvature)
+        columns = np.empty((*present.shape, self.root.shape[1]))
+        for j, (plus, minus, factor) in enumerate(self.moves):
+            first, second = (
+                simulation.run(simulation.prepare_run(moved, "predict", part.u, part.y, None, ""), x0)
+                for moved in (plus, minus))
+            columns[:, :, j] = np.where(present, (second - first) * factor, 0.0)
+        if self.curvature is not None:
+            more = self.root[len(self.root) - self.curvature.coefficients(self.model.nx) :]
+            products = self.curvature.response(self.predictor, part, present) @ more
+            columns -= np.where(present[:, :, None], products, 0.0)
+        return columns, self.predictor.jumps(0, present)
+
+    def whitened_parts(self, data: Data) -> Iterator[tuple[Experiment, Array, np.ndarray, Array]]:
+        """Yield every experiment with its initial state, which readings are there, and its whitened innovations."""
+        raw = in_units_of(self.model, data)
+        found: list[Any] = as_list(whiten(self.model, raw, scale=self.predictor))
+        for part, white in zip(raw.experiments, found):
+            yield part, white.states[0], white.present, white.r.ravel()
 
     def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True,
                  seen: Callable[[Array], Array] | None = None) -> Nuisance:
-        """Return the effect of the uncertainty on the whitened innovations of a record.
+        """Return the effect of the uncertainty on the whitened innovations of a record with some readings `present`.
 
-        Args:
-            part: the record, in raw units.
-            x0: (n,) its initial state.
-            present: (N, l) whether there is a reading.
-            free_start: whether the initial state is unknown, because it was estimated from this record.
-            seen: what whitens changes (N, l, d) of the innovations; the predictor by default.
+        With `free_start` its initial state (n,) is unknown, because it was estimated from it. Changes (N, l, d) of the
+        innovations are whitened by `seen`, by default the predictor.
         """
 
         def diffuse(changes: Array) -> Array:
@@ -190,9 +170,8 @@ class ModelUncertainty:
         return Nuisance(U, s, unknown)
 
 
-def model_uncertainty(
-    model: "HammersteinSS", data: Data, *, healthy: Data | None = None, decoupled: Predictor | None = None,
-) -> ModelUncertainty:
+def model_uncertainty(model: HammersteinSS, data: Data, *, healthy: Data | None = None,
+                      decoupled: Predictor | None = None) -> ModelUncertainty:
     """Return the covariance of the parameters of a model, from the record it was identified from.
 
     All entries of the matrices that are not zero throughout, the gain, the offsets and the coefficients of the
@@ -220,60 +199,57 @@ def model_uncertainty(
             model, noise=replace(noise, R=noise.R + model.nx / count * noise.innovation)))
     gained = replace(model, K=steady.K)
     own, parts = len(parameters(gained)[0]), in_units_of(model, data).experiments
-    low, high = (limit([limit(part.y, axis=0) for part in parts], axis=0) for limit in (np.fmin.reduce, np.fmax.reduce))
+    readings = np.vstack([part.y for part in parts])
     curvature: Products | None = Products.of(parts)
     if curvature.coefficients(model.nx) > min(LARGEST, count // OFTEN - own):
         curvature = None
-    gathered = _gathered(gained, steady, data, curvature)
+    size = own + (0 if curvature is None else curvature.coefficients(model.nx))
+    gathered = _gathered(ModelUncertainty(gained, steady, np.eye(size), 0, curvature=curvature), data)
     found = _estimated(gathered, own)
     if curvature is not None and not found.deviation:
-        wider = _estimated(gathered, len(gathered.information))
-        found, curvature = (wider, curvature) if wider.deviation else (found, None)
-    steady = replace(steady, covariance=found.scale**2 * steady.covariance, root=steady.root / found.scale)
-    factor = 1.0 if healthy is not None else found.factor
+        wider = _estimated(gathered, size)
+        found = wider if wider.deviation else found
+    factor = max(overdispersion(*one) for one in found.sections) if healthy is None else 1.0
     root = np.sqrt(factor) * found.root
     if found.deviation:
         root = np.column_stack([root, found.moved])
-    result = ModelUncertainty(gained, steady, root, gathered.readings, factor, np.array([low, high]), found.deviation,
+    steady = replace(steady, covariance=found.scale**2 * steady.covariance, root=steady.root / found.scale)
+    levels = np.array([np.fmin.reduce(readings), np.fmax.reduce(readings)])
+    result = ModelUncertainty(gained, steady, root, gathered.readings, factor, levels, found.deviation,
                               curvature if len(root) > own else None)
     return result if healthy is None else _inflated(result, healthy)
 
 
 class Gathered(NamedTuple):
-    """What a record says about parameters.
+    """What a record says about parameters."""
 
-    Attributes:
-        information: (p, p).
-        readings: less those that initial states and decoupled disturbances take.
-        energy: of the whitened innovations.
-        sections: products (p, p) of the sensitivities, and (p,) with the innovations, of sections in the order of time
-            and in that of the operating point.
-    """
-
-    information: Array
-    readings: int
-    energy: float
+    information: Array  # (p, p)
+    readings: int  # less those that initial states and decoupled disturbances take
+    energy: float  # of the whitened innovations
+    # products (p, p) of the sensitivities, and (p,) with the innovations, of sections in the order of time and in that
+    # of the operating point
     sections: tuple[list[tuple[Array, Array]], list[tuple[Array, Array]]]
 
 
 class Estimated(NamedTuple):
-    """Root (p, q) of a covariance for one section, the factor of it, the deviation (p,) and its size, and the scale."""
+    """The covariance of the first of the parameters, the others being zero."""
 
-    root: Array
-    factor: float
-    moved: Array
-    deviation: float
-    scale: float
+    root: Array  # (p, q) of the covariance for one section
+    moved: Array  # (p,) their deviation from the most likely ones
+    deviation: float  # its size, in standard deviations
+    scale: float  # of the innovations
+    sections: list[Any]  # pairs of arguments of `overdispersion`, for both orders
 
 
-def _gathered(model: "HammersteinSS", steady: Predictor, data: Data, curvature: Products | None) -> Gathered:
-    size = len(parameters(model)[0]) + (0 if curvature is None else curvature.coefficients(model.nx))
+def _gathered(every: ModelUncertainty, data: Data) -> Gathered:
+    """Return what a record says about parameters of unit covariance."""
+    steady, size = every.predictor, len(every.root)
     information, readings, energy = np.zeros((size, size)), 0, 0.0
     sections: tuple[list[tuple[Array, Array]], ...] = [], []
     length = max(sum(len(part.y) for part in data.experiments) // SECTIONS, 1)
-    for part, x0, present, white in _whitened_parts(model, steady, data):
-        by_parameter, by_start = (steady.whitened_columns(effect, present) for effect in
-                                  sensitivities(model, steady, part, x0, present, np.eye(size), curvature))
+    for part, x0, present, white in every.whitened_parts(data):
+        by_parameter, by_start = (steady.whitened_columns(effect, present)
+                                  for effect in every.sensitivities(part, x0, present))
         basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
         basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
         rest = by_parameter - basis @ (basis.T @ by_parameter)
@@ -295,11 +271,7 @@ def _gathered(model: "HammersteinSS", steady: Predictor, data: Data, curvature: 
 
 
 def _estimated(gathered: Gathered, size: int) -> Estimated:
-    """Return the covariance of the first parameters, the others being zero.
-
-    Raises:
-        DataError: fewer than two readings for each direction of the parameters that changes the predictions.
-    """
+    """Return the covariance of the first parameters; errors as of `model_uncertainty`."""
     information, readings = gathered.information[:size, :size], gathered.readings
     sizes = np.sqrt(np.diag(information))
     sizes[sizes == 0] = 1.0
@@ -308,8 +280,7 @@ def _estimated(gathered: Gathered, size: int) -> Estimated:
     if readings < 2 * int(known.sum()):
         raise DataError(
             f"{readings} readings (beside the initial states) do not determine the parameters well enough for a "
-            f"covariance of the model: {int(known.sum())} directions change its predictions. Use a longer record."
-        )
+            f"covariance of the model: {int(known.sum())} directions change its predictions. Use a longer record.")
     scale = float(np.sqrt(gathered.energy / (readings - int(known.sum()))))
     unit = axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
     grams = [[unit.T @ gram[:size, :size] @ unit for gram, _ in one] for one in gathered.sections]
@@ -319,9 +290,8 @@ def _estimated(gathered: Gathered, size: int) -> Estimated:
     deviation = float(np.sqrt(max(score @ moved, 0.0)))
     if deviation**2 <= len(score) + REJECTED * np.sqrt(2 * len(score)):
         deviation, moved = 0.0, 0 * moved
-    factor = max(overdispersion(gram, [one - part @ moved for one, part in zip(along, gram)])
-                 for along, gram in zip(scores, grams))
-    return Estimated(scale * unit, factor, scale * unit @ moved, deviation, scale)
+    left = [[one - part @ moved for one, part in zip(along, gram)] for along, gram in zip(scores, grams)]
+    return Estimated(scale * unit, scale * unit @ moved, deviation, scale, list(zip(grams, left)))
 
 
 def _operating_point(y: Array) -> Array:
@@ -339,9 +309,8 @@ def _operating_point(y: Array) -> Array:
 def overdispersion(grams: Sequence[Array], correlations: Sequence[Array]) -> float:
     """Return the factor c of the covariance of parameters that vary between sections; 1 where they need not vary.
 
-    Args:
-        grams: for each section S'S (q, q), the sensitivity S to parameters of unit covariance; their sum is at most I.
-        correlations: for each section S'r (q,) with its whitened innovations r.
+    Of each section are given S'S (q, q), S being the sensitivity to parameters of unit covariance, and S'r (q,) with
+    its whitened innovations r; the sum of the S'S is at most I.
     """
     spreads, squares = [], []
     for gram, along in zip(grams, correlations):
@@ -363,7 +332,7 @@ def overdispersion(grams: Sequence[Array], correlations: Sequence[Array]) -> flo
 def _inflated(found: ModelUncertainty, healthy: Data) -> ModelUncertainty:
     """Multiply the covariance by the largest factor that a healthy record allows."""
     spreads, squares = [], []
-    for part, x0, present, white in _whitened_parts(found.model, found.predictor, healthy):
+    for part, x0, present, white in found.whitened_parts(healthy):
         nuisance = found.nuisance(part, x0, present)
         axes = nuisance.s < np.sqrt(DIFFUSE)  # the others are those of the initial state
         spreads.append(nuisance.s[axes] ** 2)
@@ -376,11 +345,8 @@ def largest_factor(s2: Array, z2: Array) -> float:
     """Return the upper bound of the factor c of the variances 1 + c s^2, at least one.
 
     It is the largest c for which so small an energy has a probability of 1 - `CONFIDENCE`, the axes weighted by their
-    information on c near one: exact for Gaussian innovations that are linear in the parameters.
-
-    Args:
-        s2: (q,) squared singular values of the nuisance.
-        z2: (q,) squared whitened innovations along its axes.
+    information on c near one: exact for Gaussian innovations that are linear in the parameters. s2 (q,) are squared
+    singular values of the nuisance, z2 (q,) squared whitened innovations along its axes.
     """
     weights, factors = s2 / (1 + s2) ** 2, np.geomspace(*FACTORS)
     drawn = np.random.default_rng(0).chisquare(1, (DRAWS, s2.size))
@@ -389,23 +355,13 @@ def largest_factor(s2: Array, z2: Array) -> float:
     return float(allowed[-1]) if allowed.size else 1.0
 
 
-def _whitened_parts(
-    model: "HammersteinSS", steady: Predictor, data: Data
-) -> "Iterator[tuple[Experiment, Array, np.ndarray, Array]]":
-    """Yield every experiment with its estimated initial state, its readings present, and its whitened innovations."""
-    raw = in_units_of(model, data)
-    found: list[Any] = as_list(whiten(model, raw, scale=steady))
-    for part, white in zip(raw.experiments, found):
-        yield part, white.states[0], white.present, white.r.ravel()
-
-
-def uncertain_start(model: "HammersteinSS", steady: Predictor) -> ModelUncertainty:
+def uncertain_start(model: HammersteinSS, steady: Predictor) -> ModelUncertainty:
     """Return the uncertainty of an exact model in records whose initial state is estimated."""
     gained = replace(model, K=steady.K)
     return ModelUncertainty(gained, steady, np.zeros((len(parameters(gained)[0]), 0)), 0)
 
 
-def parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], "HammersteinSS"]]:
+def parameters(model: HammersteinSS) -> tuple[Array, Array, Callable[[Array], HammersteinSS]]:
     """Return the parameters, a step for each, and the function that builds the model of given parameters."""
     used = [name for name in MATRICES if np.any(getattr(model, name))]
     functions = [*model.nonlinearities, *model.feedback]
@@ -413,46 +369,12 @@ def parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], 
     steps = [STEP * (np.abs(part) + np.sqrt(np.mean(part**2)) + 1e-8) for part in parts if part.size]
     edges = np.cumsum([0, *(part.size for part in parts)])
 
-    def back(theta: Array) -> "HammersteinSS":
+    def back(theta: Array) -> HammersteinSS:
         cut = [theta[a:b] for a, b in zip(edges, edges[1:])]
         changes: dict[str, Any] = {
-            name: part.reshape(np.shape(getattr(model, name))) for name, part in zip(used, cut)
-        }
+            name: part.reshape(np.shape(getattr(model, name))) for name, part in zip(used, cut)}
         moved = [replace(f, mu=part) for f, part in zip(functions, cut[len(used) :])]
         inputs = len(model.nonlinearities)
         return replace(model, nonlinearities=tuple(moved[:inputs]), feedback=tuple(moved[inputs:]), **changes)
 
     return np.concatenate(parts), np.concatenate(steps), back
-
-
-def moved_models(
-    model: "HammersteinSS", root: Array
-) -> "Iterator[tuple[HammersteinSS, HammersteinSS, float]]":
-    """Yield two models on both sides along every column of root, and the factor of their difference."""
-    theta, steps, back = parameters(model)
-    root = root[: len(theta)]  # those of the model
-    largest = np.abs(root / steps[:, None]).max(axis=0, initial=0.0)
-    largest[largest == 0] = 1.0
-    for column, size in zip(root.T, largest):  # no parameter moves by more than its step
-        yield back(theta + column / size), back(theta - column / size), float(size / 2)
-
-
-def sensitivities(
-    model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: Array, root: Array,
-    curvature: Products | None = None,
-) -> tuple[Array, Array]:
-    """Derivatives (N, l, q) and (N, l, n) of the innovations along the columns of root and by the start.
-
-    The last rows of root are those of the products, where there are any.
-    """
-    columns = np.empty((*present.shape, root.shape[1]))
-    for j, (plus, minus, factor) in enumerate(moved_models(model, root)):
-        first, second = (
-            simulation.run(simulation.prepare_run(moved, "predict", part.u, part.y, None, ""), x0)
-            for moved in (plus, minus)
-        )
-        columns[:, :, j] = np.where(present, (second - first) * factor, 0.0)
-    if curvature is not None:
-        more = root[len(root) - curvature.coefficients(model.nx) :]
-        columns -= np.where(present[:, :, None], curvature.response(steady, part, present) @ more, 0.0)
-    return columns, steady.jumps(0, present)

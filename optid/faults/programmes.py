@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from optid.data.record import Data
     from optid.faults.consistency.bounded_noise import Membership
     from optid.faults.consistency.profiles import Profile
-    from optid.faults.search.calibration import Thresholds
+    from optid.faults.false_alarms import Thresholds
     from optid.faults.search.scanning import Scan
     from optid.faults.search.sparse import SparseResult
     from optid.faults.signatures import Dictionary
@@ -41,9 +41,8 @@ def signature_estimate(found: "Scan", limits: "Thresholds", **how: Any) -> "Spar
     return solve_registered("fault.signature", found, limits, **how)
 
 
-def membership(
-    model: Any, data: "Data", bounds: Any = None, faults: "Dictionary | None" = None, **how: Any
-) -> "Membership":
+def membership(model: Any, data: "Data", bounds: Any = None, faults: "Dictionary | None" = None,
+               **how: Any) -> "Membership":
     """Prove by linear programming that no healthy plant within bounds of its noise made a window (`fault.membership`).
 
     Bounds are a number of standard deviations (three by default) or {"process": (n,), "output": (l,)}; candidates of

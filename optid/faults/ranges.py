@@ -1,69 +1,64 @@
-"""Inputs outside the range over which a function was identified, where the effect of the actuator is unknown.
+"""Channels outside the range of the identification: how far, since when, and what of a record is used then.
 
-A linear function is extrapolated, for which the covariance of its parameters accounts, up to `FAR` half ranges from the
-middle of its range; a nonlinear one is known inside its range. Beyond, the effect f(u) is modelled as a disturbance of
-unlimited variance, which is removed from innovations and signatures like the unknown initial state. A record in which a
-linear input stays there, or which is outside too often, is used up to that sample.
+What a model of a smooth plant lacks grows with the distance from the middle of the range. The effect of an actuator is
+unknown where its input is outside the range over which its function was identified. A linear function is extrapolated,
+for which the covariance of its parameters accounts, up to `FAR` half ranges from the middle; a nonlinear one is known
+inside its range. Beyond, the effect f(u) is modelled as a disturbance of unlimited variance, which is removed from
+innovations and signatures like the unknown initial state. A record in which a linear input stays there, or which is
+outside too often, is used up to that sample.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.bases import Linear, UserFunctions
 from optid.errors import DataError
+from optid.models import HammersteinSS
 from optid.models.model import impulse_response
 
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
+TOLERATED = 0.02  # share of the range by which an input may leave it as long as no output shows it
+UNSEEN = 0.1  # largest shift of an output by the unknown effect that is tolerated, in standard deviations of the noise
+REACH = 50  # samples of the impulse response that are considered
+MOST = 400  # largest number of samples outside
+FAR = 1.5  # distance from the middle of the range, in half ranges, up to which a linear function is extrapolated
+STAY = 3  # samples in a row outside, from which on a record is not used
+BEYOND = 1.1  # distance from the middle of its range, in half ranges, from which a channel is far outside it
 
-TOLERATED = 0.02
-"""Share of the range by which an input may leave it as long as no output shows it."""
 
-UNSEEN = 0.1
-"""Largest shift of an output by the unknown effect that is tolerated, in standard deviations of the noise."""
+def distance(values: Array, ends: Array | None) -> Array:
+    """Return how far values (N, c) are from the middle of ranges (2, c), in half ranges; one inside.
 
-REACH = 50
-"""Samples of the impulse response that are considered."""
-
-MOST = 400
-"""Largest number of samples outside."""
-
-FAR = 1.5
-"""Distance from the middle of the range, in half ranges, up to which a linear function is extrapolated."""
-
-STAY = 3
-"""Samples in a row outside, from which on a record is not used."""
+    One value only is no range, nor is an infinite one, nor None; a missing value is inside.
+    """
+    if ends is None:
+        return np.ones(values.shape)
+    low, high = ends
+    with np.errstate(invalid="ignore"):
+        span = np.where(np.isfinite(high - low) & (high > low), high - low, np.inf)
+        far = np.abs(2 * values - low - high) / span
+    return np.where((values < low) | (values > high), np.fmax(far, 1.0), 1.0)
 
 
 class Outside(NamedTuple):
-    """An input that leaves its range.
+    """An input that leaves its range."""
 
-    Attributes:
-        name: of the input.
-        column: function of the input.
-        interval: its range.
-        samples: where it is outside; for a linear function, where it is too far outside.
-        is_linear: whether the function is linear.
-    """
-
-    name: str
-    column: int
-    interval: tuple[float, float]
-    samples: np.ndarray
-    is_linear: bool
+    name: str  # of the input
+    column: int  # function of the input
+    interval: tuple[float, float]  # its range
+    samples: np.ndarray  # where it is outside; for a linear function, where it is too far outside
+    is_linear: bool  # whether the function is linear
 
     def __str__(self) -> str:
         """State the input, the range and the samples."""
         low, high = self.interval
         return (
             f"{self.name} is {'far ' * self.is_linear}outside the identified range [{low:.4g}, {high:.4g}] in "
-            f"{self.samples.size} samples, first in sample {self.samples[0]}: its effect there is not judged."
-        )
+            f"{self.samples.size} samples, first in sample {self.samples[0]}: its effect there is not judged.")
 
 
-def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
+def outside(model: HammersteinSS, u: Array) -> list[Outside]:
     """Return the inputs (N, m) that leave the range their nonlinearities were identified over.
 
     A function without an interval, or one that the user gave, is known everywhere.
@@ -79,7 +74,7 @@ def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
     return found
 
 
-def usable_range(model: "HammersteinSS") -> tuple[Array, Array]:
+def usable_range(model: HammersteinSS) -> tuple[Array, Array]:
     """Return (low, high), both (K,): `known_range`, and for linear functions how far they are extrapolated."""
     low, high = known_range(model)
     for column, f in enumerate(model.nonlinearities):
@@ -89,7 +84,7 @@ def usable_range(model: "HammersteinSS") -> tuple[Array, Array]:
     return low, high
 
 
-def input_range_notes(model: "HammersteinSS", u: Array) -> list[str]:
+def input_range_notes(model: HammersteinSS, u: Array) -> list[str]:
     """State the inputs (N, m) whose linear functions are extrapolated, and since when."""
     (low, high), notes = known_range(model), []
     for column, f in enumerate(model.nonlinearities):
@@ -102,7 +97,7 @@ def input_range_notes(model: "HammersteinSS", u: Array) -> list[str]:
     return notes
 
 
-def usable_samples(model: "HammersteinSS", u: Array) -> tuple[int, str]:
+def usable_samples(model: HammersteinSS, u: Array) -> tuple[int, str]:
     """Return how many samples of inputs (N, m) are used, and why not all of them; "" where all are.
 
     Raises:
@@ -123,7 +118,7 @@ def usable_samples(model: "HammersteinSS", u: Array) -> tuple[int, str]:
                         f"{one.interval[1]:.4g}].")
 
 
-def known_range(model: "HammersteinSS") -> tuple[Array, Array]:
+def known_range(model: HammersteinSS) -> tuple[Array, Array]:
     """Return (low, high), both (K,), between which every function of an input is known with sufficient accuracy.
 
     This is its interval, extended by `TOLERATED` of its length, or by less where the outputs would show the difference
@@ -144,7 +139,15 @@ def known_range(model: "HammersteinSS") -> tuple[Array, Array]:
     return low, high
 
 
-def unsure_since(model: "HammersteinSS", u: Array, memory: int) -> np.ndarray:
+def by_input(model: HammersteinSS, ends: tuple[Array, Array]) -> Array:
+    """Return ranges (2, m) of the inputs, from those of their functions, low and high (K,); infinite without any."""
+    found = np.full((2, model.m), np.inf) * [[-1.0], [1.0]]
+    np.maximum.at(found[0], list(model.input_of), ends[0])
+    np.minimum.at(found[1], list(model.input_of), ends[1])
+    return found
+
+
+def unsure_since(model: HammersteinSS, u: Array, memory: int) -> np.ndarray:
     """Return which samples (N,) follow an input outside its range within `memory` samples."""
     edges = np.zeros(len(u) + memory + 2, dtype=int)
     for one in outside(model, u):
@@ -153,7 +156,7 @@ def unsure_since(model: "HammersteinSS", u: Array, memory: int) -> np.ndarray:
     return np.cumsum(edges)[: len(u)] > 0
 
 
-def unknown_effects(model: "HammersteinSS", u: Array) -> tuple[Array, Array]:
+def unknown_effects(model: HammersteinSS, u: Array) -> tuple[Array, Array]:
     """Return the unknown effects outside the range in the state (N, n, K) and in the output (N, l, K).
 
     Raises:
@@ -162,16 +165,10 @@ def unknown_effects(model: "HammersteinSS", u: Array) -> tuple[Array, Array]:
     count, there = len(u), outside(model, u)
     total = sum(one.samples.size for one in there)
     if total > min(MOST, count // 2):
-        raise DataError(
-            f"{' '.join(map(str, there))} This part is too long to be left out: identify the "
-            "model over the wider range, or cut the record."
-        )
+        raise DataError(f"{' '.join(map(str, there))} This part is too long to be left out: identify the model over "
+                        "the wider range, or cut the record.")
     into_state, into_output = np.zeros((count, model.nx, total)), np.zeros((count, model.l, total))
-    k = 0
-    for one in there:
-        for sample in one.samples:
-            if sample + 1 < count:
-                into_state[sample + 1, :, k] = model.B[:, one.column]
-            into_output[sample, :, k] = model.D[:, one.column]
-            k += 1
+    for k, (sample, column) in enumerate((sample, one.column) for one in there for sample in one.samples):
+        into_state[sample + 1 : sample + 2, :, k] = model.B[:, column]
+        into_output[sample, :, k] = model.D[:, column]
     return into_state, into_output

@@ -1,21 +1,16 @@
 """One check of readings before any search: frozen, saturated and dead sensors, on a stream or on a record."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array
 
-DEAD = 10
-"""Consecutive missing readings of a sensor, while the inputs are present, after which it is dead."""
-
-FROZEN = 5
-"""Fewest consecutive identical readings of a frozen sensor."""
-
-CHANCE = 1e-10
-"""Largest probability of that many identical readings of a healthy sensor."""
+DEAD = 10  # consecutive missing readings of a sensor, while the inputs are present, after which it is dead
+FROZEN = 5  # fewest consecutive identical readings of a frozen sensor
+CHANCE = 1e-10  # largest probability of that many identical readings of a healthy sensor
 
 FLAT = 3
 """Identical readings of a frozen sensor that repeats no other reading in a record.
@@ -24,8 +19,7 @@ A sensor that repeats readings with the probability p shows this in N healthy on
 N p^2 exp(-N p), at most .5 / N.
 """
 
-USUAL = 2
-"""A gap of a record is dead if it is more than so many times as long as any other one of the sensor."""
+USUAL = 2  # a gap of a record is dead if it is more than so many times as long as any other one of the sensor
 
 
 class SensorFinding(NamedTuple):
@@ -46,23 +40,14 @@ class SensorFinding(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LostReadings:
-    """A stretch of a record in which a sensor is frozen, saturated or dead.
+    """A stretch of a record in which a sensor is frozen, saturated or dead."""
 
-    Attributes:
-        name: "sensor:y1".
-        condition: "frozen", "saturated" or "dead".
-        experiment: index of the experiment.
-        first: first sample of the equal readings or of the missing ones.
-        count: number of these readings.
-        value: the reading; NaN of a dead sensor.
-    """
-
-    name: str
-    condition: str
-    experiment: int
-    first: int
-    count: int
-    value: float
+    name: str  # "sensor:y1"
+    condition: str  # "frozen", "saturated" or "dead"
+    experiment: int  # index of the experiment
+    first: int  # first sample of the equal readings or of the missing ones
+    count: int  # number of these readings
+    value: float  # the reading; NaN of a dead sensor
 
     @property
     def is_dead(self) -> bool:
@@ -187,10 +172,7 @@ def lost_readings(y: Array, outputs: Sequence[str], experiment: int = 0) -> tupl
             lines.append(LostReadings(f"sensor:{outputs[o]}", "frozen", experiment, first, repeats.size + 1,
                                       float(y[first, o])))
     limits = {(one.name, one.value) for one in lines if one.condition == "saturated"}
-    conditions = ["saturated" if (one.name, one.value) in limits else one.condition for one in lines]
-    lines = [LostReadings(one.name, condition, experiment, one.first, one.count, one.value)
-             for one, condition in zip(lines, conditions)]
-    return tuple(one for one in lines
+    return tuple(replace(one, condition="saturated") if (one.name, one.value) in limits else one for one in lines
                  if not one.is_dead or one.count > USUAL * _longest_other_gap(y, outputs, one))
 
 

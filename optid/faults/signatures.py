@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,30 +13,19 @@ from optid.errors import DataWarning, LookupFailed, StructureError, nearest
 from optid.faults.directions import decouple
 from optid.faults.faults import Fault
 from optid.faults.kinds import FaultKind, all_kinds, kind_of
-from optid.faults.places import channel_of, place_of
+from optid.faults.places import channel_of, functions_of, place_of
 from optid.faults.ranges import known_range
 from optid.faults.whitening import Predictor, predictor
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 STANDING, STATE_JUMP = "stuck", "jump"
 """The kind of an actuator to whose effect any constant is added, and that of the state by default."""
 
-SAME = 1e-3
-"""Sine of the angle between two signatures below which no record isolates them."""
-
-NEAR = 0.3
-"""Sine of the angle between two signatures below which only large faults are isolable."""
-
-UNSEEN = 1e-9
-"""Share of its largest possible size below which a signature is zero."""
-
-FORGOTTEN = 1e-4
-"""Share of its largest value below which a signature has decayed."""
-
-LONGEST = 4000
-"""Largest number of samples over which signatures are compared."""
+SAME = 1e-3  # sine of the angle between two signatures below which no record isolates them
+NEAR = 0.3  # sine of the angle between two signatures below which only large faults are isolable
+UNSEEN = 1e-9  # share of its largest possible size below which a signature is zero
+FORGOTTEN = 1e-4  # share of its largest value below which a signature has decayed
+LONGEST = 4000  # largest number of samples over which signatures are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +98,7 @@ class Candidate:
         """The same actuator with any constant added beside the share lost."""
         return replace(self, kind=STANDING)
 
-    def rest_values(self, model: "HammersteinSS") -> Array:
+    def rest_values(self, model: HammersteinSS) -> Array:
         """Return the functions of the inputs (r,) at the input without effect, from which a share lost counts."""
         if self.zero is None or self.has_constants:
             return np.zeros(model.B.shape[1])
@@ -131,7 +119,7 @@ class Dictionary:
         unknown: whether "none of these" is a possible answer.
     """
 
-    model: "HammersteinSS"
+    model: HammersteinSS
     predictor: Predictor
     candidates: tuple[Candidate, ...]
     excluded: Mapping[str, str]
@@ -154,7 +142,7 @@ class Dictionary:
         rows, columns = np.nonzero(np.triu(np.nan_to_num(self.sines, nan=1.0) < NEAR, 1))
         return [(self.labels[i], self.labels[j], float(self.sines[i, j])) for i, j in zip(rows, columns)]
 
-    def belongs_to(self, model: "HammersteinSS") -> bool:
+    def belongs_to(self, model: HammersteinSS) -> bool:
         """Whether it is a dictionary of a model, with disturbances declared or not."""
         same = self.model is model or all(
             np.array_equal(getattr(self.model, name), getattr(model, name)) for name in "ABCDEL")
@@ -221,12 +209,10 @@ class Dictionary:
         return "\n".join(lines + ["  unknown: none of these"] * self.unknown)
 
 
-def dictionary(
-    model: "HammersteinSS", *, actuators: str | Sequence[str] = "all", sensors: str | Sequence[str] = "all",
-    kinds: str | Sequence[str] = ("bias",), process: Mapping[str, ArrayLike] | None = None, state_jump: bool = True,
-    schedules: Mapping[str, Fault] | None = None, unknown: bool = True, zeros: Mapping[str, float] | None = None,
-    disturbances: Sequence[str] = (),
-) -> Dictionary:
+def dictionary(model: HammersteinSS, *, actuators: str | Sequence[str] = "all", sensors: str | Sequence[str] = "all",
+               kinds: str | Sequence[str] = ("bias",), process: Mapping[str, ArrayLike] | None = None,
+               state_jump: bool = True, schedules: Mapping[str, Fault] | None = None, unknown: bool = True,
+               zeros: Mapping[str, float] | None = None, disturbances: Sequence[str] = ()) -> Dictionary:
     """Build the dictionary of possible faults; merge those that are not isolable, exclude those without effect.
 
     Args:
@@ -300,21 +286,17 @@ def _chosen(wanted: str | Sequence[str], names: tuple[str, ...]) -> list[str]:
     return chosen
 
 
-def candidate_of(
-    model: "HammersteinSS", name: str, kind: str, process: Mapping[str, ArrayLike] | None = None,
-    zeros: Mapping[str, float] | None = None,
-) -> Candidate:
+def candidate_of(model: HammersteinSS, name: str, kind: str, process: Mapping[str, ArrayLike] | None = None,
+                 zeros: Mapping[str, float] | None = None) -> Candidate:
     """Return a candidate by its name and kind; arguments and errors as of `place_of` and `dictionary`."""
     into_state, into_output = place_of(model, name, None, process)
     new = Candidate(name, kind, into_state, into_output, places=(name,))
     if new.fault_kind.driven and name.startswith("actuator"):
-        c = channel_of(model.inputs, name)
-        columns = tuple(i for i, of in enumerate(model.input_of) if of == c)
-        new = replace(new, columns=columns, zero=(zeros or {}).get(name.partition(":")[2]))
+        new = replace(new, columns=tuple(functions_of(model, name)), zero=(zeros or {}).get(name.partition(":")[2]))
     return replace(new, members=(new.own_label,))
 
 
-def _check_zero(model: "HammersteinSS", name: str, value: float) -> None:
+def _check_zero(model: HammersteinSS, name: str, value: float) -> None:
     """Refuse an input without effect that lies where its function is not known."""
     for column, (low, high) in enumerate(zip(*known_range(model))):
         if model.inputs[model.input_of[column]] != name or low <= value <= high:
@@ -343,8 +325,7 @@ def _seen(steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> 
     trace = response(steady, candidate, _horizon(steady))
     possible = np.linalg.norm(steady.root) * (
         np.linalg.norm(candidate.into_state, axis=0) * max(np.linalg.norm(steady.C), 1e-300)
-        + np.linalg.norm(candidate.into_output, axis=0)
-    )
+        + np.linalg.norm(candidate.into_output, axis=0))
     _, sizes, axes = np.linalg.svd(trace.reshape(-1, trace.shape[2]), full_matrices=False)
     there = sizes > UNSEEN * max(float(possible.max(initial=0.0)), 1e-300)
     if not there.any():

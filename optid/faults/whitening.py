@@ -2,13 +2,14 @@
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array, as_list, compact, one_or_all
-from optid.data.record import Data, Experiment
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.models import HammersteinSS
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
@@ -16,46 +17,27 @@ from optid.models.recursions import SHORT, propagate
 from optid.models.roots import spectral_radius
 from optid.phrases import p_value
 
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
-
-LAGS = 20
-"""Lags of the whiteness test."""
-
-NOT_WHITE = 1e-3
-"""p-value of whiteness below which thresholds are refused."""
-
-FORGETS = 1 - 1e-9
-"""Largest spectral radius of A - K C."""
+LAGS = 20  # lags of the whiteness test
+NOT_WHITE = 1e-3  # p-value of whiteness below which thresholds are refused
+FORGETS = 1 - 1e-9  # largest spectral radius of A - K C
 
 ADDED = 1e-2
 """Measurement noise, as a share of the innovations, that is added where the noise has no power at some frequency."""
 
-OTHER_SCALE = 1.3
-"""Ratio of the innovations to their predicted size above which thresholds are refused."""
+OTHER_SCALE = 1.3  # ratio of the innovations to their predicted size above which thresholds are refused
 
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
-    """The steady predictor of a model, x+ = A x + ... + K (y - C x - ...).
+    """The steady predictor of a model, x+ = A x + ... + K (y - C x - ...)."""
 
-    Attributes:
-        A: (n, n) of the model.
-        C: (l, n) of the model.
-        L: (n, l) output injection of the model.
-        K: (n, l) gain.
-        covariance: (l, l) of the innovations.
-        root: (l, l) lower triangular; root times an innovation has unit covariance.
-        silent: number of axes of the innovations left out, because declared disturbances affect them.
-    """
-
-    A: Array
-    C: Array
-    L: Array
-    K: Array
-    covariance: Array
-    root: Array
-    silent: int = 0
+    A: Array  # (n, n) of the model
+    C: Array  # (l, n) of the model
+    L: Array  # (n, l) output injection of the model
+    K: Array  # (n, l) gain
+    covariance: Array  # (l, l) of the innovations
+    root: Array  # (l, l) lower triangular; root times an innovation has unit covariance
+    silent: int = 0  # number of axes of the innovations left out, because declared disturbances affect them
 
     @property
     def F(self) -> Array:  # noqa: N802 - the field's letter
@@ -68,16 +50,11 @@ class Predictor:
         radius = float(np.max(np.abs(np.linalg.eigvals(self.F)), initial=0.0))
         return len(self.F) if radius == 0 else len(self.F) + int(np.ceil(np.log(1e-6) / np.log(min(radius, 1 - 1e-9))))
 
-    def respond(
-        self, into_state: Array, into_output: Array, present: Array | None = None, A: Array | None = None
-    ) -> Array:
+    def respond(self, into_state: Array, into_output: Array, present: Array | None = None,
+                A: Array | None = None) -> Array:
         """Return the response (N, l, d) of the innovations to additions to x(k) (N, n, d) and to y(k) (N, l, d).
 
-        Args:
-            into_state: (N, n, d).
-            into_output: (N, l, d).
-            present: (N, l) whether there is a reading; all by default.
-            A: (N, n, n) of a plant that changes; that of the model by default.
+        All readings are `present` (N, l) by default, and the plant does not change; else it has A (N, n, n).
         """
         if A is None and len(into_output) <= SHORT and (present is None or present.all()):
             drive = into_state.copy()
@@ -118,7 +95,7 @@ class Predictor:
         return self.whiten(changes, present).reshape(present.size, -1)
 
 
-def predictor(model: "HammersteinSS") -> Predictor:
+def predictor(model: HammersteinSS) -> Predictor:
     """Return the steady Kalman predictor of a model with noise covariances.
 
     Raises:
@@ -131,10 +108,8 @@ def predictor(model: "HammersteinSS") -> Predictor:
         raise StructureError("Every record of this model has its own level, which a fault of a sensor would pass "
                              "for: choose the level of the plant by model.at_level(constant).")
     if model.noise is None:
-        raise StructureError(
-            "The model has no noise covariances, which give the scale of its innovations: estimate them with "
-            "optid.noise.with_noise(model, data)."
-        )
+        raise StructureError("The model has no noise covariances, which give the scale of its innovations: estimate "
+                             "them with optid.noise.with_noise(model, data).")
     noise, failure = model.noise, ""
     for added in (0.0, ADDED):
         try:
@@ -154,17 +129,11 @@ def predictor(model: "HammersteinSS") -> Predictor:
 
 @dataclass(frozen=True, eq=False)
 class Nuisance:
-    """(I + M M')^(-1/2) = I - U diag(1 - 1/sqrt(1 + s^2)) U' with the singular values s of M.
+    """(I + M M')^(-1/2) = I - U diag(1 - 1/sqrt(1 + s^2)) U' with the singular values s of M."""
 
-    Attributes:
-        U: (N l, q) orthonormal.
-        s: (q,).
-        unknown: number of unknown axes beside the initial state.
-    """
-
-    U: Array
-    s: Array
-    unknown: int = 0
+    U: Array  # (N l, q) orthonormal
+    s: Array  # (q,)
+    unknown: int = 0  # number of unknown axes beside the initial state
 
     @property
     def log_scale(self) -> float:
@@ -178,39 +147,18 @@ class Nuisance:
         return np.asarray((flat - self.U @ (drop[:, None] * (self.U.T @ flat))).reshape(r.shape))
 
 
-class UncertainInnovations(Protocol):
-    """What whitening asks of the uncertainty of an identified model: a predictor, and its effect on a window."""
-
-    @property
-    def predictor(self) -> Predictor:
-        """The predictor of its noise."""
-        ...
-
-    def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
-        """Return the effect on the innovations of an experiment with readings (N, l) from a state (n,)."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """Whitened innovations of one record.
+    """Whitened innovations of one record."""
 
-    Attributes:
-        r: (N, l), zero where a reading is missing; N(0, I) for a healthy plant.
-        innovations: (N, l) before whitening, NaN where a reading is missing.
-        present: (N, l) whether there is a reading.
-        predictor: the predictor behind them.
-        outputs: names of the outputs.
-        nuisance: effect of uncertain parameters on the innovations, removed from r; None for a model taken as exact.
-        states: (N, n) of the predictor, for faults that change the matrices; None where they are not known.
-    """
-
-    r: Array
-    innovations: Array
-    present: Array
-    predictor: Predictor
-    outputs: tuple[str, ...]
+    r: Array  # (N, l), zero where a reading is missing; N(0, I) for a healthy plant
+    innovations: Array  # (N, l) before whitening, NaN where a reading is missing
+    present: Array  # (N, l) whether there is a reading
+    predictor: Predictor  # the predictor behind them
+    outputs: tuple[str, ...]  # names of the outputs
+    # effect of uncertain parameters on the innovations, removed from r; None for a model taken as exact
     nuisance: Nuisance | None = None
+    # (N, n) of the predictor, for faults that change the matrices; None where they are not known
     states: Array | None = None
 
     def whiten_signature(self, signature: Array) -> Array:
@@ -219,27 +167,16 @@ class Whitened:
         return white if self.nuisance is None else self.nuisance(white)
 
 
-def check_window(
-    model: "HammersteinSS", whitened: Whitened, what: str, onset: int = 0, longest: float = np.inf
-) -> None:
-    """Refuse whitened innovations that a search or a test cannot take.
-
-    Args:
-        model: of the innovations.
-        whitened: the window.
-        what: the search or the test, for messages.
-        onset: sample of the window at which a change is assumed.
-        longest: largest number of readings of a window.
+def check_window(model: HammersteinSS, whitened: Whitened, what: str, onset: int = 0, longest: float = np.inf) -> None:
+    """Refuse whitened innovations that a search or a test (`what`) of at most `longest` readings cannot take.
 
     Raises:
-        StructureError: several experiments, an onset outside the window, a window that is too long.
+        StructureError: several experiments, an onset of a change outside the window, a window that is too long.
         DataError: other outputs than the model's, innovations that are not finite.
     """
     if not isinstance(whitened, Whitened):
-        raise StructureError(
-            f"{what} takes the whitened innovations of one experiment, as returned by optid.faults.whiten: pass the "
-            "experiments of a record one by one."
-        )
+        raise StructureError(f"{what} takes the whitened innovations of one experiment, as returned by "
+                             "optid.faults.whiten: pass the experiments of a record one by one.")
     count, outputs = whitened.r.shape
     if outputs != model.l:
         raise DataError(f"The window has {outputs} outputs; the dictionary is of {model.l}.")
@@ -253,10 +190,8 @@ def check_window(
         raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
 
 
-def whiten(
-    model: "HammersteinSS", data: Data, *, x0: Any = "fit", uncertainty: UncertainInnovations | None = None,
-    scale: Predictor | None = None,
-) -> Any:
+def whiten(model: HammersteinSS, data: Data, *, x0: Any = "fit", uncertainty: Any = None,
+           scale: Predictor | None = None) -> Any:
     """Return the whitened innovations of a record; a tuple for several experiments.
 
     A missing reading is not used for correction.
@@ -294,21 +229,13 @@ def whiten(
 
 @dataclass(frozen=True, eq=False)
 class Health:
-    """Whiteness and size of the innovations of a healthy record, compared with the model.
+    """Whiteness and size of the innovations of a healthy record, compared with the model."""
 
-    Attributes:
-        ratios: {output: size of its innovations over the predicted one}.
-        p_value: of the hypothesis that the innovations are white (portmanteau test of Hosking).
-        lags: its lags.
-        samples: number of complete samples.
-        covariance: (l, l) of the whitened innovations; the identity is expected.
-    """
-
-    ratios: dict[str, float]
-    p_value: float
-    lags: int
-    samples: int
-    covariance: Array
+    ratios: dict[str, float]  # {output: size of its innovations over the predicted one}
+    p_value: float  # of the hypothesis that the innovations are white (portmanteau test of Hosking)
+    lags: int  # its lags
+    samples: int  # number of complete samples
+    covariance: Array  # (l, l) of the whitened innovations; the identity is expected
 
     @property
     def ratio(self) -> float:
@@ -331,8 +258,7 @@ class Health:
         return (
             f"innovations over {self.samples} samples: p-value of whiteness {p_value(self.p_value, 3)} "
             f"({self.lags} lags)\n"
-            f"size over the predicted one: {sizes}; largest {self.ratio:.3f}"
-        )
+            f"size over the predicted one: {sizes}; largest {self.ratio:.3f}")
 
     def predictor(self, steady: Predictor, *, rescale: bool = False) -> Predictor:
         """Return the predictor to use for thresholds.
@@ -351,8 +277,7 @@ class Health:
             raise DataError(
                 f"The innovations of the healthy record are not white (p-value {p_value(self.p_value)}): thresholds "
                 "from this model would be wrong. Fit the model again, include the uncertainty of the identified "
-                "model (model_uncertainty), or watch with Monitor(..., healthy=record), which takes the noise from it."
-            )
+                "model (model_uncertainty), or watch with Monitor(..., healthy=record), which takes the noise from it.")
         if rescale:
             covariance = np.linalg.solve(steady.root, np.linalg.solve(steady.root, self.covariance).T)
             covariance = (covariance + covariance.T) / 2
@@ -361,8 +286,7 @@ class Health:
             raise DataError(
                 f"The innovations of the healthy record are {self.ratio:.2f} times as large as the model predicts "
                 f"({', '.join(f'{name} {ratio:.2f}' for name, ratio in self.ratios.items())}): the scale of the noise "
-                "is wrong. Pass rescale=True to take it from this record, or estimate the noise again."
-            )
+                "is wrong. Pass rescale=True to take it from this record, or estimate the noise again.")
         if self.ratio < 1 / OTHER_SCALE:
             warnings.warn(
                 f"The innovations are only {self.ratio:.2f} times as large as the model predicts: small faults will be "

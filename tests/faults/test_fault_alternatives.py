@@ -26,7 +26,7 @@ from optid.faults.diagnosis.posterior import estimates
 from optid.faults.diagnosis.records import record_of
 from optid.faults.diagnosis.sensor_gains import SensorGain, sensor_gains
 from optid.faults.nuisance import uncertain_start
-from optid.faults.ranges import known_range
+from optid.faults.ranges import distance, known_range
 from optid.models import Nonlinearity
 
 COUNT = 160
@@ -309,6 +309,13 @@ def test_without_an_actuator_that_moves_it_is_said_what_is_out_of_reach():
     target = left.attainable([1.0, 2.0])
     assert not target.reachable and "nothing acts on y1, y2" in str(target)
     np.testing.assert_allclose(target.y, dead.equilibrium(np.zeros(2))[1])
+
+
+def test_the_distance_from_a_range_is_one_inside_and_where_there_is_no_range():
+    ends = np.array([[-1.0, 2.0, -np.inf], [1.0, 2.0, np.inf]])  # a range, one value only, no limits
+    values = np.array([[0.5, 2.0, 9.0], [-3.0, 7.0, -9.0], [np.nan, np.nan, np.nan]])
+    np.testing.assert_array_equal(distance(values, ends), [[1, 1, 1], [3, 1, 1], [1, 1, 1]])
+    np.testing.assert_array_equal(distance(values, None), np.ones((3, 3)))
 
 
 @pytest.mark.parametrize(("direct", "room"), [(0.0, 0.048), (1.0, 0.048), (200.0, None)])

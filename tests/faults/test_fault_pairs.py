@@ -11,7 +11,7 @@ from test_fault_scan import KINDS, LOAD, random_model, record
 from optid import Data
 from optid.errors import DataWarning, StructureError
 from optid.faults import Fault, best_subsets, dictionary, inject, model_uncertainty, scan, thresholds, whiten
-from optid.faults.search.calibration import Thresholds
+from optid.faults.false_alarms import Thresholds
 
 
 def penalties(found, seed=0):

@@ -289,8 +289,7 @@ def test_thresholds_of_a_typical_input_hold_on_the_average():
     limits, rng = thresholds(found, 40, 0.05, u=levels(4000, 0), seed=1), np.random.default_rng(2)
     rates = [
         np.mean(np.any(prepared.largest(rng.normal(size=(200, 40, 2))) > limits.q, axis=1))
-        for prepared in (sweep(found, 40, u=levels(40, 100 + i)) for i in range(100))
-    ]
+        for prepared in (sweep(found, 40, u=levels(40, 100 + i)) for i in range(100))]
     assert abs(np.mean(rates) - 0.05) < 0.006
 
 

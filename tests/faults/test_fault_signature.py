@@ -23,7 +23,7 @@ from optid.faults import (
     thresholds,
     whiten,
 )
-from optid.faults.search.atoms import atoms_of
+from optid.faults.search.sparse import atoms_of
 from optid.program.solution import Status
 from optid.registry import fault_formulation
 from optid.solving.solve import solve

@@ -12,7 +12,7 @@ from test_fault_injection import small
 from optid import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults import Fault, health, inject, model_uncertainty, predictor, whiten
-from optid.faults.nuisance import largest_factor, overdispersion, parameters, sensitivities
+from optid.faults.nuisance import largest_factor, overdispersion, parameters
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.kalman import kalman_gain
 
@@ -181,8 +181,8 @@ def test_parameters_that_are_not_the_most_likely_ones_deviate_by_what_their_reco
     assert 15 < found.deviation < 25 and "hammerstein_ss.exact" in found.remark
     assert right.deviation == 0 and right.remark == ""
     part, present = data.experiments[0], np.ones((1000, model.l), dtype=bool)
-    displacement = np.column_stack([20 * right.root[:, -1], found.root[:, -1]])
-    moves, _ = sensitivities(right.model, right.predictor, part, np.zeros(model.nx), present, displacement)
+    displacement = replace(right, root=np.column_stack([20 * right.root[:, -1], found.root[:, -1]]))
+    moves, _ = displacement.sensitivities(part, np.zeros(model.nx), present)
     seen = right.predictor.whitened_columns(moves, present)
     # the true parameters are not the most likely ones either: sqrt(q) standard deviations off
     assert np.linalg.norm(seen[:, 0] - seen[:, 1]) < 2 * np.sqrt(right.root.shape[1])

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.faults import Fault, hard_over_test, inject
-from optid.faults.rank.hard_over import (
+from optid.faults.hard_over import (
     MARGIN,
     ChannelRegression,
     HardOver,

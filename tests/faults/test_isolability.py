@@ -15,8 +15,8 @@ from optid import Data
 from optid.cli.app import app
 from optid.errors import DataError, LookupFailed, StructureError
 from optid.faults import Fault, dictionary, inject, isolability, whiten
+from optid.faults.false_alarms import family_thresholds
 from optid.faults.isolability_study import GRID, MIDDLE
-from optid.faults.search.calibration import family_thresholds
 from optid.faults.search.sweeps import sweep
 
 

@@ -16,8 +16,7 @@ from optid.errors import DataError, DataWarning, ModelFileError, StructureError
 from optid.faults import Fault, Monitor, diagnose, dictionary, inject, whiten
 from optid.models import Nonlinearity
 
-HIGH = 1e9
-"""A threshold that nothing exceeds."""
+HIGH = 1e9  # a threshold that nothing exceeds
 
 
 def plant(feedback=False):
@@ -343,8 +342,8 @@ def test_outside_the_identified_range_thresholds_grow_for_a_window(tmp_path):
     single, raised = [], []
     for a, b in zip(u, y):
         single += steps.step(a, b)
-        raised.append(steps.decisions.thresholds[0] / 20.0)
-    half = (steps.checks.high[0] - steps.checks.low[0]) / 2
+        raised.append(steps.decisions.limits.thresholds[0] / 20.0)
+    half = np.ptp(steps.checks.known[:, 0]) / 2
     assert raised[99] == raised[201] == 1 and raised[142] == 5  # 3.0 is far out
     assert raised[143] == raised[199] == pytest.approx((1.8 / half) ** 4)
     first = blocks.run(u[:180], y[:180])

@@ -7,7 +7,7 @@ from test_monitor import everything, plant
 
 from optid.errors import DataError, StructureError
 from optid.faults import Monitor, cusum_arl, dictionary, inject
-from optid.faults.monitor.arl import Calibration, equalised, tail
+from optid.faults.false_alarms import Calibration, equalised, tail
 
 
 @pytest.mark.parametrize("shift, arl", [(0.0, 465.4), (0.5, 38.0), (1.0, 10.38), (2.0, 4.01)])

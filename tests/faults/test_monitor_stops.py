@@ -103,7 +103,7 @@ def follow(folder, name, capsys, errors=False):
         else:
             monitor = Monitor.load(kept.path)
         reader = RowReader(["u1", "u2"], ["y1", "y2"], dt=1.0)
-        monitoring._Watch(monitor, reader, folder / "grown.csv", kept, monitoring._Habits(False, True, False)).run(True)
+        monitoring._Watch(monitor, reader, folder / "grown.csv", kept, as_json=True).run(True)
     told = capsys.readouterr()
     return " ".join(told.err.split()) if errors else told.out.splitlines(), monitor
 
@@ -237,8 +237,7 @@ def test_a_full_disk_ends_no_monitor(tmp_path, monkeypatch, capsys, what):
     with StateFile(tmp_path / "full.npz") as kept:
         monitor = watch(undisturbed.dictionary.model, undisturbed.dictionary, 40, 35.0)
         reader = RowReader(["u1", "u2"], ["y1", "y2"], dt=1.0)
-        habits = monitoring._Habits(False, True, False)
-        monitoring._Watch(monitor, reader, tmp_path / "grown.csv", kept, habits).run(True)
+        monitoring._Watch(monitor, reader, tmp_path / "grown.csv", kept, as_json=True).run(True)
     told = capsys.readouterr()
     assert told.out.splitlines() == whole and Monitor.load(kept.path).samples == undisturbed.samples
     errors = " ".join(told.err.split())

@@ -13,31 +13,22 @@ are among them: then neither one that drifts nor one beside an actuator is added
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.faults.diagnosis.posterior import Explanation, share_bound, share_prior
 from optid.faults.signatures import Candidate, Dictionary, candidate_of
+from optid.models import HammersteinSS
 
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
-
-UNLISTED = 0.1
-"""Prior of a fault outside the dictionary, relative to one inside."""
-
-LEAK = "bias"
-"""Kind of the disturbance of unknown direction that always competes."""
-
-UNKNOWN_DIRECTION = "process"
-"""Name of a disturbance whose direction is estimated."""
+UNLISTED = 0.1  # prior of a fault outside the dictionary, relative to one inside
+LEAK = "bias"  # kind of the disturbance of unknown direction that always competes
+UNKNOWN_DIRECTION = "process"  # name of a disturbance whose direction is estimated
 
 INTEGRATES = 1e10
 """Condition number above which the plant integrates: a constant disturbance has no steady-state effect."""
 
-EXACT = 1e-12
-"""Variance of a share lost that is known."""
+EXACT = 1e-12  # variance of a share lost that is known
 
 
 def with_unlisted_candidates(found: Dictionary) -> Dictionary | None:
@@ -136,7 +127,7 @@ def _stuck(found: Explanation, first: int) -> Explanation:
     )
 
 
-def final_effect(model: "HammersteinSS", name: str, size: Array) -> dict[str, float]:
+def final_effect(model: HammersteinSS, name: str, size: Array) -> dict[str, float]:
     """Return the steady-state effect on every output of a constant disturbance of estimated direction (n,).
 
     It is empty for other faults and for unknown sizes.

@@ -132,54 +132,30 @@ class Certificate:
         """Whether there is evidence."""
         return self.basis != "none"
 
-    @property
-    def excludes_health(self) -> bool:
-        """Whether it proves that no healthy plant made the record."""
-        return self.parity_vector is not None
-
 
 @dataclass(frozen=True, eq=False)
 class Remaining:
-    """Residual of the best answer, or of the healthy plant where there is none.
+    """Residual of the best answer, or of the healthy plant where there is none."""
 
-    Attributes:
-        energy: sum of squares of the residual, whitened.
-        readings: their number, less the estimated magnitudes; about the energy where the answer is right.
-        p_value: smallest p-value of the tests of the residual, corrected for their number.
-        test: the test with this p-value: "energy", "period", "burst" or "candidate".
-        direction: (l,) unit vector of the outputs, in their units, with most of the energy.
-        frequency: peak of the spectrum of the residual, in cycles per sample.
-        share: of the energy, within one line of that frequency.
-    """
-
-    energy: float
-    readings: int
-    p_value: float
-    test: str
-    direction: Array
-    frequency: float
-    share: float
+    energy: float  # sum of squares of the residual, whitened
+    readings: int  # their number, less the estimated magnitudes; about the energy where the answer is right
+    p_value: float  # smallest p-value of the tests of the residual, corrected for their number
+    test: str  # the test with this p-value: "energy", "period", "burst" or "candidate"
+    direction: Array  # (l,) unit vector of the outputs, in their units, with most of the energy
+    frequency: float  # peak of the spectrum of the residual, in cycles per sample
+    share: float  # of the energy, within one line of that frequency
 
 
 @dataclass(frozen=True, eq=False)
 class SearchEvidence:
-    """Innovations and statistics of a diagnosis, for figures and for the course of a fault.
+    """Innovations and statistics of a diagnosis, for figures and for the course of a fault."""
 
-    Attributes:
-        r: (N, l) whitened innovations.
-        present: (N, l) whether there is a reading.
-        fitted: (N, l) fit of the best answer; zero where there is none.
-        gains: (C, N) energy explained less the threshold, NaN where a candidate is not tested.
-        labels: the C candidates.
-        search: the scan; None where no candidate has a signature.
-    """
-
-    r: Array
-    present: np.ndarray
-    fitted: Array
-    gains: Array
-    labels: tuple[str, ...]
-    search: "Scan | None"
+    r: Array  # (N, l) whitened innovations
+    present: np.ndarray  # (N, l) whether there is a reading
+    fitted: Array  # (N, l) fit of the best answer; zero where there is none
+    gains: Array  # (C, N) energy explained less the threshold, NaN where a candidate is not tested
+    labels: tuple[str, ...]  # the C candidates
+    search: "Scan | None"  # the scan; None where no candidate has a signature
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -298,11 +274,7 @@ class Diagnosis(Rendered):
         return replace(found, best=found.candidates[int(content["best"])])
 
     def save(self, path: str | Path) -> Path:
-        """Write it to a JSON file without loss of precision.
-
-        Args:
-            path: the file, replaced when it exists.
-        """
+        """Write it to a JSON file, which is replaced when it exists, without loss of precision."""
         from optid.models.files import write
 
         return write(self.to_dict(), path, FORMAT, VERSION)
@@ -310,9 +282,6 @@ class Diagnosis(Rendered):
 
 def load_diagnosis(path: str | Path) -> Diagnosis:
     """Read a diagnosis from a file written by `Diagnosis.save`.
-
-    Args:
-        path: the file.
 
     Raises:
         FileNotFoundError: no such file.
@@ -357,5 +326,4 @@ def _built(kind: Any, value: Any) -> Any:
         value = {**value, "candidate": {"name": value["name"], "kind": value["kind"], **value["candidate"]}}
     return kind(**{
         part.name: _built(part.type, value[part.name]) for part in fields(kind)
-        if part.name in value or part.default is part.default_factory is MISSING
-    })
+        if part.name in value or part.default is part.default_factory is MISSING})

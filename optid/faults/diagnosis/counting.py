@@ -8,7 +8,7 @@ signatures differ by less than these errors are then about equally probable.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,13 +16,10 @@ from optid.arrays import Array
 from optid.faults.diagnosis.posterior import Explanation, bounded_shares, least_squares, marginal
 from optid.faults.nuisance import ModelUncertainty, Nuisance
 from optid.faults.places import place_of
+from optid.faults.search.scanning import Scan
 from optid.faults.signatures import Candidate
 
-if TYPE_CHECKING:
-    from optid.faults.search.scanning import Scan
-
-SMALL = 1e-3
-"""Singular values below which an error of a signature is neglected."""
+SMALL = 1e-3  # singular values below which an error of a signature is neglected
 
 
 def with_model_uncertainty(found: Explanation, uncertainty: ModelUncertainty | None) -> Explanation:
@@ -57,7 +54,7 @@ def with_model_uncertainty(found: Explanation, uncertainty: ModelUncertainty | N
     ).without_negligible_onsets()
 
 
-def trace_error(scan: "Scan", uncertainty: ModelUncertainty, candidate: Candidate, onset: int, size: Array) -> Nuisance:
+def trace_error(scan: Scan, uncertainty: ModelUncertainty, candidate: Candidate, onset: int, size: Array) -> Nuisance:
     """Return the covariance of the signature of a fault of size (d,) due to the errors of the parameters."""
     white = scan.whitened
 

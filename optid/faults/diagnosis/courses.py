@@ -17,20 +17,11 @@ from optid.faults.diagnosis.posterior import NEGLIGIBLE, Explained, Explanation,
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened
 
-LONGEST = 3000
-"""Number of readings above which these candidates are not tested."""
-
-STILL = 1.5
-"""Largest deviation of a frozen reading, in standard deviations of the sensor noise."""
-
-SHORTEST = 5
-"""Least number of constant samples."""
-
-VARIANCES = np.geomspace(1e-2, 1e4, 61)
-"""Variances of an added noise, relative to the inverse mean eigenvalue of H H'."""
-
-ONSETS = 12
-"""Onsets of an added noise tried over the record, and again around the best of them."""
+LONGEST = 3000  # number of readings above which these candidates are not tested
+STILL = 1.5  # largest deviation of a frozen reading, in standard deviations of the sensor noise
+SHORTEST = 5  # least number of constant samples
+VARIANCES = np.geomspace(1e-2, 1e4, 61)  # variances of an added noise, relative to the inverse mean eigenvalue of H H'
+ONSETS = 12  # onsets of an added noise tried over the record, and again around the best of them
 
 
 def without_signature(found: Dictionary) -> tuple[list[Candidate], list[Candidate]]:

@@ -2,48 +2,36 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from optid.data.record import Data
 from optid.data.timeline import Timeline
 from optid.errors import StructureError
+from optid.faults.diagnosis import records
 from optid.faults.diagnosis.alternatives import final_effect
 from optid.faults.diagnosis.answers import Certificate, Diagnosis, Estimate, FaultAnswer, SearchEvidence
 from optid.faults.diagnosis.courses import LONGEST
 from optid.faults.diagnosis.posterior import estimates
 from optid.faults.diagnosis.ranking import NOTHING, RankedExplanation, explain_record
 from optid.faults.diagnosis.record_search import Question, RecordSearch, search_record
-from optid.faults.diagnosis.records import (
-    lost_sensors,
-    plant_of,
-    record_of,
-    steady_predictor,
-    uncertainty_of,
-    without_lost_readings,
-)
+from optid.faults.false_alarms import Thresholds
 from optid.faults.nuisance import uncertain_start
 from optid.faults.ranges import input_range_notes, outside, usable_samples
 from optid.faults.screening import check_channels
-from optid.faults.search.calibration import Thresholds
 from optid.faults.signatures import Dictionary, dictionary
+from optid.models import HammersteinSS
 from optid.threads import one_thread
 
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
-
-KINDS = "bias", "loss", "spike"
-"""Kinds of faults of the default dictionary."""
+KINDS = "bias", "loss", "spike"  # kinds of faults of the default dictionary
 
 
 @one_thread
-def diagnose(
-    model: Any, data: Any, faults: Dictionary | None = None, *, false_alarm: float = 0.01, max_faults: int = 1,
-    method: str = "exact", model_uncertainty: Any = None, coverage: float = 0.95, robust: bool = False,
-    healthy: Any = None, rescale: bool = False, thresholds: Thresholds | None = None, seed: int | None = 0,
-    solver: Any = "auto",
-) -> Any:
+def diagnose(model: Any, data: Any, faults: Dictionary | None = None, *, false_alarm: float = 0.01, max_faults: int = 1,
+             method: str = "exact", model_uncertainty: Any = None, coverage: float = 0.95, robust: bool = False,
+             healthy: Any = None, rescale: bool = False, thresholds: Thresholds | None = None, seed: int | None = 0,
+             solver: Any = "auto") -> Any:
     """Diagnose a record: healthy or faulty, which fault, its onset and size.
 
     Every candidate of the dictionary is tried at every onset; the answer is a set of candidates that contains the true
@@ -79,12 +67,12 @@ def diagnose(
         StructureError: no noise covariances, impossible arguments, "use" without the covariance of the model.
     """
     asked = Question(false_alarm, max_faults, method, coverage, robust, thresholds, seed, solver)
-    plant, origin = plant_of(model)
-    record, found = record_of(plant, data), _dictionary(plant, faults)
-    steady, decoupled = steady_predictor(plant, healthy, rescale), None
+    plant, origin = records.plant_of(model)
+    record, found = records.record_of(plant, data), _dictionary(plant, faults)
+    steady, decoupled = records.steady_predictor(plant, healthy, rescale), None
     if found.predictor.silent:
         plant, decoupled = found.model, found.predictor
-    uncertainty, remark = uncertainty_of(plant, origin, model_uncertainty, decoupled)
+    uncertainty, remark = records.uncertainty_of(plant, origin, model_uncertainty, decoupled)
     if steady is None or decoupled is not None:  # an uncertain model has its own scale
         steady = found.predictor if uncertainty is None else uncertainty.predictor
     if steady is not found.predictor:
@@ -96,13 +84,12 @@ def diagnose(
     return results[0] if len(results) == 1 else tuple(results)
 
 
-def _dictionary(model: "HammersteinSS", faults: Dictionary | None) -> Dictionary:
+def _dictionary(model: HammersteinSS, faults: Dictionary | None) -> Dictionary:
     if faults is None:
         return dictionary(model, kinds=KINDS)
     if not isinstance(faults, Dictionary):
         raise StructureError(
-            f"faults is a {type(faults).__name__}: pass the dictionary of optid.faults.dictionary(model, kinds=[...])."
-        )
+            f"faults is a {type(faults).__name__}: pass the dictionary of optid.faults.dictionary(model, kinds=[...]).")
     if not faults.belongs_to(model):
         raise StructureError("The dictionary is of another model: build it with optid.faults.dictionary(model, ...).")
     return faults
@@ -112,10 +99,10 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
           ) -> Diagnosis:
     """Return the diagnosis of an experiment; `noise` are arguments of `whiten`, and the remark is reported."""
     model = found.model
-    part, lines = without_lost_readings(record, number)
+    part, lines = records.without_lost_readings(record, number)
     count, cut = usable_samples(model, part.u)
     part = replace(part, u=part.u[:count], y=part.y[:count])
-    stuck = lost_sensors(lines, found, 2 * model.nx)
+    stuck = records.lost_sensors(lines, found, 2 * model.nx)
     first = search_record(record, part, found, asked, noise)
     notes = [remark, cut, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u)),
              *input_range_notes(model, part.u), *first.extrapolated]
@@ -128,7 +115,7 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
         notes.append("With one output only faults with a known course are isolable.")
     timeline = record.timelines[number]
     answers = _answers(seen, fits, stuck, timeline)
-    certificate = ranking.certificate if fits or ranking.certificate.excludes_health else NOTHING
+    certificate = ranking.certificate if fits or ranking.certificate.parity_vector is not None else NOTHING
     if stuck and not fits:
         certificate = Certificate("flat line", float(max(line.count for line in lines)))
     remaining = None

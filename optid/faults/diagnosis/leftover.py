@@ -10,21 +10,15 @@ from optid.arrays import Array
 from optid.faults.diagnosis.answers import Remaining
 from optid.faults.whitening import Whitened
 
-UNFIT = 1e-3
-"""p-value of the residual below which an answer does not explain the record."""
-
-BURSTS = 1, 3, 10, 30
-"""Lengths, in samples, of the bursts searched for."""
+UNFIT = 1e-3  # p-value of the residual below which an answer does not explain the record
+BURSTS = 1, 3, 10, 30  # lengths, in samples, of the bursts searched for
 
 
 def remainder_test(whitened: Whitened, rest: Array, magnitudes: int, further: float = 1.0) -> Remaining:
-    """Return the tests of the residual of a window.
+    """Return the tests of a residual (N, l), the whitened innovations less the signature of the answer.
 
-    Args:
-        whitened: the window.
-        rest: (N, l) whitened innovations less the signature of the answer.
-        magnitudes: number of parameters estimated from the window, the initial state among them.
-        further: p-value of the search of the residual for a further fault.
+    So many magnitudes were estimated from the window, the initial state among them; `further` is the p-value of the
+    search of the residual for a further fault.
     """
     from scipy.special import chdtrc
 
@@ -37,8 +31,7 @@ def remainder_test(whitened: Whitened, rest: Array, magnitudes: int, further: fl
              "candidate": further}
     worst = min(tests, key=lambda name: tests[name])
     return Remaining(
-        energy, readings, min(1.0, len(tests) * tests[worst]), worst, _direction(whitened, rest), frequency, share
-    )
+        energy, readings, min(1.0, len(tests) * tests[worst]), worst, _direction(whitened, rest), frequency, share)
 
 
 def alarm_probability(gain: float, false_alarm: float) -> float:

@@ -18,35 +18,23 @@ from optid.faults.search.scanning import Scan, scan
 from optid.faults.signatures import Dictionary, candidate_of
 from optid.faults.whitening import Whitened
 
-BOUND = 2.5
-"""Standard deviations at which residuals are clipped."""
-
-WILD = 4.5
-"""Standard deviations from which on a spike is removed."""
-
-MOST = 0.05
-"""Largest share of the readings removed."""
-
-ROUNDS = 20
-"""Largest number of searches on clipped innovations."""
-
-AT_ONCE = 4
-"""Largest number of faults whose signatures are not clipped."""
-
-LIKELY = 5.0
-"""Least log-likelihood ratio of such a fault against the healthy plant."""
+BOUND = 2.5  # standard deviations at which residuals are clipped
+WILD = 4.5  # standard deviations from which on a spike is removed
+MOST = 0.05  # largest share of the readings removed
+ROUNDS = 20  # largest number of searches on clipped innovations
+AT_ONCE = 4  # largest number of faults whose signatures are not clipped
+LIKELY = 5.0  # least log-likelihood ratio of such a fault against the healthy plant
 
 
-def cleaned(
-    found: Dictionary, part: Experiment, whitened_of: Callable[[Experiment], Whitened]
-) -> tuple[Scan, Experiment, tuple[tuple[int, int], ...]]:
+def cleaned(found: Dictionary, part: Experiment,
+            whitened_of: Callable[[Experiment], Whitened]) -> tuple[Scan, Experiment, tuple[tuple[int, int], ...]]:
     """Return the search of the clipped innovations, the record without outliers, and these as (sample, output)."""
     wide, taken, whitened = with_spikes(found), [], whitened_of(part)
     while len(taken) < MOST * whitened.present.sum():
         search = scan(wide, whitened, part.u)
         reading = _wildest(search)
         if reading is None:  # perhaps hidden by a fault
-            reading = _wildest(scan(wide, replace(whitened, r=whitened.r - _fitted(search)), part.u))
+            reading = _wildest(search.again(whitened.r - _fitted(search)))
         if reading is None:
             break
         taken.append(reading)
@@ -98,8 +86,8 @@ def _bounded(found: Dictionary, whitened: Whitened, u: Array) -> Scan:
             if _likeliest(rest)[2] < LIKELY:
                 break
             fitted = fitted + _fitted(rest)
-            rest = scan(found, replace(search.whitened, r=search.whitened.r - fitted), u)
-        search = scan(found, replace(whitened, r=fitted + np.clip(whitened.r - fitted, -BOUND, BOUND)), u)
+            rest = search.again(search.whitened.r - fitted)
+        search = search.again(fitted + np.clip(whitened.r - fitted, -BOUND, BOUND))
         if before is not None and np.allclose(fitted, before, atol=1e-3):
             break
         before = fitted

@@ -11,70 +11,43 @@ onset; the interval cuts its tails. Measured in `benchmarks/faults/intervals.py`
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.faults.diagnosis.answers import Estimate
 from optid.faults.nuisance import Nuisance
+from optid.faults.search.scanning import Scan
 from optid.faults.signatures import Candidate
 
-if TYPE_CHECKING:
-    from optid.faults.search.scanning import Scan
-
-SPREADS = 2.0, 4.0, 9.0, 25.0, 100.0, 400.0
-"""Squared deflections of the prior."""
-
-NEGLIGIBLE = 18.0
-"""Logarithm of the ratio to the largest probability below which onsets are left out."""
-
-MODEL_ERROR = 0.02
-"""Probability that a share lost outside [0, 1] is due to an error of the model."""
-
-HALVINGS = 60
-"""Bisections for a quantile of a mixture."""
+SPREADS = 2.0, 4.0, 9.0, 25.0, 100.0, 400.0  # squared deflections of the prior
+NEGLIGIBLE = 18.0  # logarithm of the ratio to the largest probability below which onsets are left out
+MODEL_ERROR = 0.02  # probability that a share lost outside [0, 1] is due to an error of the model
+HALVINGS = 60  # bisections for a quantile of a mixture
 
 
 class Explained(NamedTuple):
-    """Fit of an explanation to a window.
+    """Fit of an explanation to a window."""
 
-    Attributes:
-        fitted: (N, l) of the innovations.
-        rest: (N, l) residual, white noise where the explanation is right.
-        magnitudes: number of estimated magnitudes.
-    """
-
-    fitted: Array
-    rest: Array
-    magnitudes: int
+    fitted: Array  # (N, l) of the innovations
+    rest: Array  # (N, l) residual, white noise where the explanation is right
+    magnitudes: int  # number of estimated magnitudes
 
 
 class Explanation(NamedTuple):
-    """One set of candidates over its possible onsets.
+    """One set of candidates over its possible onsets."""
 
-    Attributes:
-        candidates: one or several.
-        onsets: (K, s) of each candidate.
-        logs: (K,) logarithms of the marginal likelihoods, the prior of the onsets included.
-        sizes: (K, d) magnitudes of all candidates by least squares, one after the other.
-        covariances: (K, d, d) for the onsets of the row.
-        energies: (K,) energy explained, or twice the gain in log-likelihood.
-        search: with the signatures; None for candidates without one.
-        course: in place of signatures, the fit to the window for an onset.
-        error: of the signature, due to the uncertainty of an identified model.
-        entries: the candidates of the search of which the candidates are special cases; empty where they are the same.
-    """
-
-    candidates: tuple[Candidate, ...]
-    onsets: np.ndarray
-    logs: Array
-    sizes: Array
-    covariances: Array
-    energies: Array
-    search: "Scan | None" = None
-    course: Callable[[int], Explained] | None = None
-    error: Nuisance | None = None
+    candidates: tuple[Candidate, ...]  # one or several
+    onsets: np.ndarray  # (K, s) of each candidate
+    logs: Array  # (K,) logarithms of the marginal likelihoods, the prior of the onsets included
+    sizes: Array  # (K, d) magnitudes of all candidates by least squares, one after the other
+    covariances: Array  # (K, d, d) for the onsets of the row
+    energies: Array  # (K,) energy explained, or twice the gain in log-likelihood
+    search: Scan | None = None  # with the signatures; None for candidates without one
+    course: Callable[[int], Explained] | None = None  # in place of signatures, the fit to the window for an onset
+    error: Nuisance | None = None  # of the signature, due to the uncertainty of an identified model
+    # the candidates of the search of which the candidates are special cases; empty where they are the same
     entries: tuple[Candidate, ...] = ()
 
     def without_negligible_onsets(self) -> "Explanation":
@@ -114,12 +87,7 @@ class Explanation(NamedTuple):
 
 
 def marginal(energies: Array, dimension: int | np.ndarray) -> Array:
-    """Return the marginal log-likelihood ratio to the healthy plant.
-
-    Args:
-        energies: energy explained, any shape.
-        dimension: number of magnitudes, one or as many as energies.
-    """
+    """Return the marginal log-likelihood ratio to the healthy plant of energies explained by so many magnitudes."""
     from scipy.special import logsumexp
 
     g = np.array(SPREADS)
@@ -127,7 +95,7 @@ def marginal(energies: Array, dimension: int | np.ndarray) -> Array:
     return np.asarray(logsumexp(terms, axis=-1) - np.log(g.size))
 
 
-def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
+def single(scan: Scan, candidate: Candidate) -> Explanation | None:
     """Return the explanation by one candidate of a search; None where it is not tested."""
     c = scan.index(candidate)
     row = scan.statistic[c]
@@ -143,7 +111,7 @@ def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
     return found._replace(logs=found.logs + bounded_shares(found.candidates, found.sizes, found.covariances))
 
 
-def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int], reach: int) -> Explanation:
+def several(scan: Scan, candidates: Sequence[Candidate], onsets: Sequence[int], reach: int) -> Explanation:
     """Return the explanation by several candidates, over the onsets within reach of the given ones."""
     ranges = []
     for candidate, onset in zip(candidates, onsets):
@@ -152,13 +120,10 @@ def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int]
         ranges.append(there[~np.isnan(row[there])])
     blocks = [
         np.stack([scan.signature(c, int(k)).reshape(scan.whitened.r.size, -1) for k in there])
-        for c, there in zip(candidates, ranges)
-    ]
-    dims = [block.shape[2] for block in blocks]
-    edges = np.cumsum([0, *dims])
-    axes = np.meshgrid(*[np.arange(len(there)) for there in ranges], indexing="ij")
-    rows = [axis.ravel() for axis in axes]
-    count, total = rows[0].size, int(edges[-1])
+        for c, there in zip(candidates, ranges)]
+    edges = np.cumsum([0, *(block.shape[2] for block in blocks)])
+    rows = np.indices([len(there) for there in ranges]).reshape(len(ranges), -1)
+    count, total = rows.shape[1], int(edges[-1])
     gram, correlation = np.empty((count, total, total)), np.empty((count, total))
     r = scan.whitened.r.ravel()
     for i, first in enumerate(blocks):
@@ -195,8 +160,7 @@ def least_squares(gram: Array, correlation: Array, floor: float = 1e-6) -> tuple
 
 def bounded_shares(candidates: Sequence[Candidate], sizes: Array, covariances: Array) -> Array:
     """Return the change (K,) of the log-likelihood because a share lost lies between 0 and 1."""
-    change = np.zeros(len(sizes))
-    first = 0
+    change, first = np.zeros(len(sizes)), 0
     for candidate in candidates:
         if candidate.fault_kind.loses:
             change += np.log(share_bound(sizes[:, first], covariances[:, first, first]))
@@ -232,8 +196,7 @@ def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tu
 
     For onsets within `edge` samples of the start or end of the window, of N samples, the size is NaN.
     """
-    weights, best, first = found.weights, found.best, 0
-    result = []
+    weights, best, first, result = found.weights, found.best, 0, []
     for number, candidate in enumerate(found.candidates):
         part = slice(first, first + candidate.dimension)
         first = part.stop
@@ -272,11 +235,7 @@ def onset_range(onsets: np.ndarray, weights: Array, coverage: float, best: int) 
 def mixture_intervals(weights: Array, means: Array, stds: Array, coverage: float) -> Array:
     """Return the central intervals (d, 2) of mixtures of K normal laws, by bisection.
 
-    Args:
-        weights: (K,) of the components.
-        means: (K, d) of the components.
-        stds: (K, d) of the components; not positive where nothing is known.
-        coverage: probability of each interval.
+    The components have weights (K,), means (K, d) and stds (K, d), which are not positive where nothing is known.
     """
     from scipy.special import ndtr
 

@@ -1,7 +1,7 @@
 """Explanations of a record by one or several candidates, ranked by probability, with their residuals."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,28 +22,20 @@ from optid.faults.diagnosis.posterior import Explanation, several, single, small
 from optid.faults.diagnosis.record_search import RecordSearch
 from optid.faults.programmes import solve_registered
 from optid.faults.search.scanning import scan
+from optid.faults.search.sparse import SparseResult
 from optid.faults.search.subsets import SubsetSearch, best_subsets
-
-if TYPE_CHECKING:
-    from optid.faults.search.sparse import SparseResult
 
 REACH = {1: 40, 2: 10, 3: 5, 4: 3}
 """Onsets on both sides of the best ones that are summed, by the number of faults; two for more faults."""
 
-FAR = 30.0
-"""Difference to the best gain beyond which choices of candidates are left out."""
-
-ATOMS = 8_000
-"""Candidates times onsets beyond which two faults are searched on a grid of onsets."""
+FAR = 30.0  # difference to the best gain beyond which choices of candidates are left out
+ATOMS = 8_000  # candidates times onsets beyond which two faults are searched on a grid of onsets
 
 NEAR, NEAR_OF_MANY = 10, 4
 """Onsets searched exactly on both sides of those of the programme, for up to two faults and for more."""
 
-STRETCH = 100
-"""Samples of the section with bounded noise, whose proof holds for the record."""
-
-BEFORE = 25
-"""Samples of this section before the best onset."""
+STRETCH = 100  # samples of the section with bounded noise, whose proof holds for the record
+BEFORE = 25  # samples of this section before the best onset
 
 TEMPERED = 0.5
 """Power of the likelihoods where outputs leave the range of the identification: the likelihood of a model that is
@@ -53,21 +45,13 @@ NOTHING = Certificate("none", float("nan"))
 
 
 class RankedExplanation(NamedTuple):
-    """An explanation with its fit.
+    """An explanation with its fit."""
 
-    Attributes:
-        explanation: candidates over their onsets.
-        probability: posterior.
-        gain: energy explained at the best onsets, less the thresholds.
-        fitted: (N, l) fit to the innovations.
-        remaining: residual.
-    """
-
-    explanation: Explanation
-    probability: float
-    gain: float
-    fitted: Array
-    remaining: Remaining
+    explanation: Explanation  # candidates over their onsets
+    probability: float  # posterior
+    gain: float  # energy explained at the best onsets, less the thresholds
+    fitted: Array  # (N, l) fit to the innovations
+    remaining: Remaining  # residual
 
     @property
     def is_unlisted(self) -> bool:
@@ -76,19 +60,12 @@ class RankedExplanation(NamedTuple):
 
 
 class Ranking(NamedTuple):
-    """The set of explanations.
+    """The set of explanations."""
 
-    Attributes:
-        fits: the smallest set with the required probability, the most probable first.
-        odds: twice the log-odds of the first against the next explanation, in the set or not.
-        certificate: of the first.
-        note: a remark for the report.
-    """
-
-    fits: tuple[RankedExplanation, ...] = ()
-    odds: float = float("inf")
-    certificate: Certificate = NOTHING
-    note: str = ""
+    fits: tuple[RankedExplanation, ...] = ()  # the smallest set with the required probability, the most probable first
+    odds: float = float("inf")  # twice the log-odds of the first against the next explanation, in the set or not
+    certificate: Certificate = NOTHING  # of the first
+    note: str = ""  # a remark for the report
 
     @property
     def explains(self) -> bool:
@@ -217,7 +194,7 @@ def _fit(seen: RecordSearch, explanation: Explanation, probability: float) -> Ra
     rest = made.rest if explanation.error is None else explanation.error(made.rest)
     further, penalty, search, limits = 1.0, 0.0, seen.search, seen.limits
     if search is not None and limits is not None:
-        gains = search.sweep.statistic(search.sweep.correlations(rest)) - limits.q[:, None]
+        gains = search.again(rest).gains(limits)
         gains[np.isnan(seen.gains)] = np.nan
         further = further_fault(gains, limits.false_alarm)
         if explanation.search is search:
@@ -239,8 +216,7 @@ def _by_programme(seen: RecordSearch) -> Ranking:
     asked, search, limits = seen.asked, seen.search, seen.limits
     if search is None or limits is None:
         raise StructureError(
-            f"method={asked.method!r} requires a candidate with a signature: add kind 'bias', or use method='exact'."
-        )
+            f"method={asked.method!r} requires a candidate with a signature: add kind 'bias', or use method='exact'.")
     try:
         result: SparseResult = solve_registered("fault.signature", search, limits, solver=asked.solver)
     except SolverFailed:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,35 +11,24 @@ from optid.arrays import Array, check_integer, check_probability
 from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError, nearest
 from optid.faults.diagnosis.alternatives import with_unlisted_candidates
+from optid.faults.diagnosis.answers import Remaining
 from optid.faults.diagnosis.courses import courses, without_signature
-from optid.faults.diagnosis.leftover import alarm_probability, remainder_test
+from optid.faults.diagnosis.leftover import further_fault, remainder_test
 from optid.faults.diagnosis.outliers import cleaned, with_spikes
 from optid.faults.diagnosis.posterior import Explanation
 from optid.faults.diagnosis.sensor_gains import sensor_gains
-from optid.faults.search.calibration import EXCEEDING, Thresholds, thresholds
-from optid.faults.search.scanning import Scan, scan
+from optid.faults.false_alarms import EXCEEDING, Thresholds
+from optid.faults.search.scanning import Scan, scan, thresholds
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, whiten
 
-if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import Remaining
-
 METHODS = "exact", "sparse", "sparse+polish", "set"
 
-UNKNOWN_SHARE = 0.1
-"""Share of the false-alarm probability for deviations outside the dictionary."""
-
-COURSE_SHARE = 0.1
-"""Share for candidates without a signature, where there are some."""
-
-SIMULATED = 2_000_000
-"""Total of samples above which fewer windows are simulated."""
-
-LEAST = 4.0
-"""Least deflection of a complete loss beside a constant offset that is testable."""
-
-DRAWS, MOST_DRAWS = 20_000, 500_000
-"""Simulated windows for the thresholds of a short record, and the largest number."""
+UNKNOWN_SHARE = 0.1  # share of the false-alarm probability for deviations outside the dictionary
+COURSE_SHARE = 0.1  # share for candidates without a signature, where there are some
+SIMULATED = 2_000_000  # total of samples above which fewer windows are simulated
+LEAST = 4.0  # least deflection of a complete loss beside a constant offset that is testable
+DRAWS, MOST_DRAWS = 20_000, 500_000  # simulated windows for the thresholds of a short record, and the largest number
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,45 +52,27 @@ class Question:
         check_integer(self.max_faults, "max_faults")
         if self.method == "exact" and self.max_faults > 2:
             raise StructureError(
-                f"max_faults={self.max_faults}: the exact search is limited to two faults. Use method='sparse+polish'."
-            )
+                f"max_faults={self.max_faults}: the exact search is limited to two faults. Use method='sparse+polish'.")
 
 
 @dataclass(frozen=True, eq=False)
 class RecordSearch:
-    """One experiment, searched; `search_record` makes it.
+    """One experiment, searched; `search_record` makes it."""
 
-    Attributes:
-        record: of the experiment.
-        given: the experiment, without flat lines.
-        dictionary: the candidates.
-        asked: options.
-        noise: arguments of `whiten`: uncertainty and scale.
-        part: the experiment without outliers.
-        whitened: its innovations, clipped at outliers.
-        search: of the innovations; None where no candidate has a signature.
-        limits: thresholds of the search; None without a search.
-        gains: (C, N) statistics less thresholds; NaN where a candidate is not tested or not testable.
-        lost: {label: why} of candidates that are not testable.
-        healthy: residual of the healthy plant.
-        outliers: (sample, output) of the removed readings.
-        narrower: the search of the same readings with fewer candidates; None without one.
-    """
-
-    record: Data
-    given: Experiment
-    dictionary: Dictionary
-    asked: Question
-    noise: Mapping[str, Any]
-    part: Experiment
-    whitened: Whitened
-    search: Scan | None
-    limits: Thresholds | None
-    gains: Array
-    lost: dict[str, str]
-    healthy: "Remaining"
-    outliers: tuple[tuple[int, int], ...]
-    narrower: "RecordSearch | None" = None
+    record: Data  # of the experiment
+    given: Experiment  # the experiment, without flat lines
+    dictionary: Dictionary  # the candidates
+    asked: Question  # options
+    noise: Mapping[str, Any]  # arguments of `whiten`: uncertainty and scale
+    part: Experiment  # the experiment without outliers
+    whitened: Whitened  # its innovations, clipped at outliers
+    search: Scan | None  # of the innovations; None where no candidate has a signature
+    limits: Thresholds | None  # thresholds of the search; None without a search
+    gains: Array  # (C, N) statistics less thresholds; NaN where a candidate is not tested or not testable
+    lost: dict[str, str]  # {label: why} of candidates that are not testable
+    healthy: Remaining  # residual of the healthy plant
+    outliers: tuple[tuple[int, int], ...]  # (sample, output) of the removed readings
+    narrower: "RecordSearch | None" = None  # the search of the same readings with fewer candidates; None without one
 
     @property
     def tested(self) -> list[Candidate]:
@@ -117,9 +88,9 @@ class RecordSearch:
     def p_value(self) -> float:
         """p-value of the healthy plant; there is an alarm at or below the false-alarm probability."""
         values = [1.0]
-        if self.limits is not None and not np.isnan(self.gains).all():
+        if self.limits is not None:
             rate = self.limits.false_alarm
-            values.append(alarm_probability(float(np.nanmax(self.gains)), rate) * self.asked.false_alarm / rate)
+            values.append(further_fault(self.gains, rate) * self.asked.false_alarm / rate)
         if self.dictionary.unknown:
             values.append(self.healthy.p_value / UNKNOWN_SHARE)
         if self.courses:
@@ -155,9 +126,8 @@ class RecordSearch:
         return wide if asked.robust else replace(wide, narrower=self)  # where outliers are removed, others may be
 
 
-def search_record(
-    record: Data, part: Experiment, found: Dictionary, asked: Question, noise: Mapping[str, Any]
-) -> RecordSearch:
+def search_record(record: Data, part: Experiment, found: Dictionary, asked: Question,
+                  noise: Mapping[str, Any]) -> RecordSearch:
     """Search one experiment; the arguments are attributes of `RecordSearch`.
 
     Raises:
@@ -170,10 +140,8 @@ def search_record(
         white, least = whiten(found.model, alone, **noise), 2 * found.model.nx + 2
         seen = int(white.present.any(axis=1).sum())
         if seen < least:
-            raise DataError(
-                f"The record has {seen} samples with a reading (repeated readings of flat lines do not count): "
-                f"{found.model.nx} states require {least}."
-            )
+            raise DataError(f"The record has {seen} samples with a reading (repeated readings of flat lines do not "
+                            f"count): {found.model.nx} states require {least}.")
         return white
 
     given, outliers = part, ()
@@ -198,19 +166,15 @@ def _limits(found: Dictionary, white: Whitened, u: Array, asked: Question) -> Th
     given, count = asked.thresholds, len(white.r)
     if given is not None:
         if given.window != count:
-            raise StructureError(
-                f"The thresholds are for windows of {given.window} samples; the record has {count}. Calibrate them "
-                f"with thresholds(faults, {count}, ...), or leave them out."
-            )
+            raise StructureError(f"The thresholds are for windows of {given.window} samples; the record has {count}. "
+                                 f"Calibrate them with thresholds(faults, {count}, ...), or leave them out.")
         return given
     rate = asked.false_alarm * (1 - UNKNOWN_SHARE * found.unknown - COURSE_SHARE * any(without_signature(found)))
     needed = int(np.ceil(EXCEEDING / rate))
     if needed > MOST_DRAWS:
-        raise DataError(
-            f"false_alarm={asked.false_alarm:g}: thresholds for so rare an alarm need {needed} simulated windows; "
-            f"{MOST_DRAWS} are the most ({EXCEEDING / MOST_DRAWS:g} is the rarest alarm). Ask for a higher "
-            "probability, or simulate them yourself: thresholds(..., draws=...)."
-        )
+        raise DataError(f"false_alarm={asked.false_alarm:g}: thresholds for so rare an alarm need {needed} simulated "
+                        f"windows; {MOST_DRAWS} are the most ({EXCEEDING / MOST_DRAWS:g} is the rarest alarm). Ask for "
+                        "a higher probability, or simulate them yourself: thresholds(..., draws=...).")
     draws = max(needed, min(DRAWS, SIMULATED // count))
     inputs = u if any(c.columns or c.schedule is not None for c in found.candidates) else None
     return thresholds(found, white, rate, u=inputs, draws=draws, seed=asked.seed)
@@ -236,8 +200,7 @@ def untestable(found: Scan) -> dict[str, str]:
                 value = float(np.linalg.eigvalsh(flat.T @ flat)[0])
                 result[candidate.label] = (
                     f"no excitation: a complete loss would have a deflection of {deflection:.2g} beside a constant "
-                    f"offset, {LEAST:g} is required (smallest Gram eigenvalue {max(value, 0.0):.2g})"
-                )
+                    f"offset, {LEAST:g} is required (smallest Gram eigenvalue {max(value, 0.0):.2g})")
         elif (candidate.additive or candidate.columns) and np.isnan(found.statistic[c]).all():
             result[candidate.label] = "it has no effect in this record"
     return result

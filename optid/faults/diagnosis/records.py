@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,34 +14,22 @@ from optid.faults.readings import LostReadings, lost_readings
 from optid.faults.screening import check_channels
 from optid.faults.signatures import Dictionary, candidate_of
 from optid.faults.whitening import Predictor, health, predictor, whiten
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
 
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
-
-def plant_of(model: Any) -> "tuple[HammersteinSS, Data | None]":
-    """Return the model, and the record it was identified from where a fit was given.
-
-    Raises:
-        StructureError: no state-space model.
-    """
+def plant_of(model: Any) -> tuple[HammersteinSS, Data | None]:
+    """Return the state-space model (else a `StructureError`), and the record it was identified from, of a fit."""
     fitted, data = getattr(model, "model", model), getattr(model, "data", None)
     if getattr(fitted, "kind", "") != "HammersteinSS":
         kind = getattr(fitted, "title", type(fitted).__name__)
-        raise StructureError(
-            f"A diagnosis requires a state-space model with noise covariances; this is a {kind}. Fit one, for example "
-            "with optid.fit(data, 'hammerstein_ss.asivid', nx=...)."
-        )
+        raise StructureError(f"A diagnosis requires a state-space model with noise covariances; this is a {kind}. Fit "
+                             "one, for example with optid.fit(data, 'hammerstein_ss.asivid', nx=...).")
     return fitted, data if isinstance(data, Data) else None
 
 
-def record_of(model: "HammersteinSS", data: Any) -> Data:
-    """Return a record in raw units with the channels of the model.
-
-    Args:
-        model: with the names of the channels.
-        data: Data, a pair (u, y) of arrays, a frame or a file with the channels as columns.
+def record_of(model: HammersteinSS, data: Any) -> Data:
+    """Return a record in raw units with the channels of the model, from any of the forms that `diagnose` takes.
 
     Raises:
         DataError: other channels, another sampling time, a missing input, no reading at all.
@@ -66,12 +54,11 @@ def record_of(model: "HammersteinSS", data: Any) -> Data:
             raise DataError(
                 f"experiment {number}: " * (raw.n_experiments > 1)
                 + f"input {raw.inputs[c]!r} is missing at sample {k}: a diagnosis requires every input. Fill it, "
-                "or cut the record there."
-            )
+                "or cut the record there.")
     return raw
 
 
-def steady_predictor(model: "HammersteinSS", healthy: Any, rescale: bool) -> Predictor | None:
+def steady_predictor(model: HammersteinSS, healthy: Any, rescale: bool) -> Predictor | None:
     """Return the predictor with the noise scale of a healthy record; None for that of the model.
 
     Raises:
@@ -88,35 +75,25 @@ def steady_predictor(model: "HammersteinSS", healthy: Any, rescale: bool) -> Pre
     return found if rescale else None
 
 
-def uncertainty_of(
-    model: "HammersteinSS", data: Data | None, wanted: Any, decoupled: Predictor | None = None
-) -> tuple[ModelUncertainty | None, str]:
+def uncertainty_of(model: HammersteinSS, data: Data | None, wanted: Any,
+                   decoupled: Predictor | None = None) -> tuple[ModelUncertainty | None, str]:
     """Return the uncertainty of the model to use, and a remark for the report.
 
-    Args:
-        model: the model.
-        data: the record it was identified from, where it is known.
-        wanted: None (used where the record is known), "use", "ignore", or a `ModelUncertainty`.
-        decoupled: the predictor decoupled from declared disturbances.
-
-    Raises:
-        StructureError: "use" without a record or a covariance.
+    Wanted is None (where the record of the identification is known), "use" (without it a `StructureError`), "ignore",
+    or a `ModelUncertainty`; `decoupled` is a predictor decoupled from declared disturbances.
     """
     if isinstance(wanted, ModelUncertainty):
         if decoupled is not None and not wanted.predictor.silent:
             raise StructureError(
                 "The predictor of this uncertainty is not decoupled from the declared disturbances: pass the fit in "
-                "place of the model, or model_uncertainty(faults.model, data, decoupled=faults.predictor)."
-            )
+                "place of the model, or model_uncertainty(faults.model, data, decoupled=faults.predictor).")
         return wanted, wanted.remark
     if wanted not in (None, "use", "ignore"):
         raise StructureError(f"model_uncertainty={wanted!r}: it must be 'use', 'ignore' or a ModelUncertainty.")
     if wanted == "use" and data is None:
-        raise StructureError(
-            "model_uncertainty='use' requires the covariance of the model: pass the fit in place of the model, or "
-            "optid.faults.model_uncertainty(model, data) with the record it was identified from. 'ignore' takes the "
-            "model as exact."
-        )
+        raise StructureError("model_uncertainty='use' requires the covariance of the model: pass the fit in place of "
+                             "the model, or optid.faults.model_uncertainty(model, data) with the record it was "
+                             "identified from. 'ignore' takes the model as exact.")
     if wanted == "ignore" or data is None:
         return None, ""
     found = model_uncertainty(model, data, decoupled=decoupled)

@@ -24,34 +24,21 @@ from optid.faults.nuisance import ModelUncertainty, Nuisance
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Predictor, Whitened, predictor
 
-SHARES, ONSETS = 17, 15
-"""Shares and onsets of a grid."""
-
-ROUNDS = 20
-"""Largest number of grids, each about the best point of the one before."""
-
-CLOSER = 0.35
-"""Range of a grid, as a share of that of the one before."""
-
-FINE = 0.6
-"""Largest distance of the shares of the last grid, in standard deviations."""
-
-LEAST = 5
-"""Samples that must follow the onset."""
-
-LOWEST, MOST = 1e-6, 0.98
-"""Smallest share, and the largest lost together with the noise: beyond it nothing is read."""
+SHARES, ONSETS = 17, 15  # shares and onsets of a grid
+ROUNDS = 20  # largest number of grids, each about the best point of the one before
+CLOSER = 0.35  # range of a grid, as a share of that of the one before
+FINE = 0.6  # largest distance of the shares of the last grid, in standard deviations
+LEAST = 5  # samples that must follow the onset
+LOWEST, MOST = 1e-6, 0.98  # smallest share, and the largest lost together with the noise: beyond it nothing is read
 
 REPEATED = 3
 """Largest number of searches, each with the effect of uncertain parameters at the best point of the one before."""
 
-AROUND = 12.0
-"""Standard deviations of the share that are searched with the effect of uncertain parameters."""
+AROUND = 12.0  # standard deviations of the share that are searched with the effect of uncertain parameters
 
 
-def sensor_gains(
-    found: Dictionary, white: Whitened, part: Experiment, uncertainty: ModelUncertainty | None
-) -> list[Explanation]:
+def sensor_gains(found: Dictionary, white: Whitened, part: Experiment,
+                 uncertainty: ModelUncertainty | None) -> list[Explanation]:
     """Return the explanations of a window by sensors of a dictionary that lost a share of their reading."""
     if white.states is None or found.model.feedback or np.any(found.model.L):
         return []
@@ -94,23 +81,14 @@ def _with_parameters(law: "Law", uncertainty: ModelUncertainty) -> "list[Law]":
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """Likelihood and share at every onset of a grid.
+    """Likelihood and share at every onset of a grid."""
 
-    Attributes:
-        gain: the fault.
-        onsets: (K,).
-        logs: (K,) marginal likelihoods, uniform over shares and onsets.
-        most: (K,) the largest likelihoods.
-        mean: (K,) of the share.
-        variance: (K,) of the share.
-    """
-
-    gain: "SensorGain"
-    onsets: np.ndarray
-    logs: Array
-    most: Array
-    mean: Array
-    variance: Array
+    gain: "SensorGain"  # the fault
+    onsets: np.ndarray  # (K,)
+    logs: Array  # (K,) marginal likelihoods, uniform over shares and onsets
+    most: Array  # (K,) the largest likelihoods
+    mean: Array  # (K,) of the share
+    variance: Array  # (K,) of the share
 
     @property
     def best(self) -> int:
@@ -125,23 +103,14 @@ class Law:
 
 @dataclass(frozen=True, eq=False)
 class SensorGain:
-    """A share of the reading of output `o` lost in a window.
+    """A share of the reading of output `o` lost in a window."""
 
-    Attributes:
-        found: the dictionary.
-        o: the output.
-        white: the healthy innovations of the window.
-        part: the window.
-        scaled: whether the noise is multiplied by what is left of the reading.
-        nuisance: the effect of uncertain parameters; that on the healthy innovations by default.
-    """
-
-    found: Dictionary
-    o: int
-    white: Whitened
-    part: Experiment
-    scaled: bool = False
-    nuisance: Nuisance | None = None
+    found: Dictionary  # the dictionary
+    o: int  # the output
+    white: Whitened  # the healthy innovations of the window
+    part: Experiment  # the window
+    scaled: bool = False  # whether the noise is multiplied by what is left of the reading
+    nuisance: Nuisance | None = None  # the effect of uncertain parameters; that on the healthy innovations by default
 
     @cached_property
     def last(self) -> int:

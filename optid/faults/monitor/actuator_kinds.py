@@ -43,15 +43,10 @@ def is_grouped(candidate: Candidate) -> bool:
 
 
 def kinds(candidate: Candidate, sizes: Array, covariance: Array, listed: Sequence[Candidate]) -> dict[str, float]:
-    """Return {label: logarithm of the marginal likelihood} of what an estimate may be.
+    """Return {label: logarithm of the marginal likelihood} of what an estimate may be, of those listed.
 
-    The offset is the family with a share of zero, the stuck actuator that with a share of one (Savage-Dickey).
-
-    Args:
-        candidate: with the estimate.
-        sizes: (d,) its magnitudes, the share lost first.
-        covariance: (d, d) of the sizes.
-        listed: the candidates of the dictionary.
+    The offset is the family with a share of zero, the stuck actuator that with a share of one (Savage-Dickey). The
+    sizes (d,), the share lost first, have the covariance (d, d).
     """
     energy = float(sizes @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ sizes)
     if candidate.additive:
@@ -72,6 +67,12 @@ def _lost(share: float, std: float) -> float:
 
     inside = [float(ndtr((most - share) / std) - ndtr(-share / std)) / most for most in (1.0, SMALL)]
     return float(np.sqrt(2 * np.pi) * std * np.mean(inside))
+
+
+def likelihoods(logs: dict[str, float]) -> dict[str, float]:
+    """Return {label: likelihood} relative to the largest one, from their logarithms."""
+    most = max(logs.values(), default=0.0)
+    return {label: float(np.exp(log - most)) for label, log in logs.items()}
 
 
 def likeliest(weights: dict[str, float], coverage: float = 0.95) -> tuple[tuple[str, float], ...]:

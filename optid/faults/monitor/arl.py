@@ -1,102 +1,54 @@
 """Thresholds of a running search from the mean time between false alarms (ARL0), by simulation.
 
 The whitened innovations of a healthy plant are white with unit covariance, so that the search itself runs on random
-numbers, without the plant; the effect of an uncertain model on them is added. The largest statistics of blocks as long
-as the window are kept. An alarm is a block that exceeds a threshold after one that did not, and the rate of alarms
-while there is none is
-
-    1 / ARL0 = -log(1 - alarms / blocks without an alarm before) / length of a block.
-
-All candidates have the same rate, such that together they have the rate 1 / ARL0.
+numbers, without the plant; the effect of an uncertain model on them is added.
 """
 
+import hashlib
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
+from optid.faults.false_alarms import COMMON, EXCEEDING, Calibration, equalised
 from optid.faults.monitor.columns import Window
+from optid.models import HammersteinSS
 
-ALARMS = 60
-"""False alarms of a simulation by default: their rate is then known to 13 %."""
+ALARMS = 60  # false alarms of a simulation by default: their rate is then known to 13 %
+LONGEST = 1_000_000  # samples simulated at most by default
+CHUNK = 20_000  # samples simulated at a time
+INPUTS, HOLD = 20_000, 5  # samples of simulated inputs, and samples per level
+RUNS = 4  # simulations that may run in parallel; the result does not depend on how many do
+NODES = 80  # nodes of the quadrature, for ten digits of the run lengths of the usual charts
 
-FEWEST = 50
-"""With fewer alarms than this the threshold is extrapolated, or refused."""
-
-LONGEST = 1_000_000
-"""Samples simulated at most by default."""
-
-CHUNK = 20_000
-"""Samples simulated at a time."""
-
-RUNS = 4
-"""Simulations that may run in parallel; the result does not depend on how many do."""
-
-COMMON = 0.1
-"""Share of blocks by whose energies a healthy record is compared with the simulation."""
-
-NODES = 80
-"""Nodes of the quadrature, for ten digits of the run lengths of the usual charts."""
+_KNOWN: dict[bytes, Calibration] = {}
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """Thresholds and their basis.
+def reference_inputs(model: HammersteinSS, u: ArrayLike | None, window: int, seed: int | None) -> Array:
+    """Return the functions (T, r) of inputs (T, m) typical of a healthy plant; of levels over its range by default.
 
-    Attributes:
-        labels: the candidates.
-        q: (C,) their thresholds.
-        arl0: requested mean number of samples between false alarms.
-        window: samples of the window.
-        samples: samples simulated.
-        alarms: false alarms among them at these thresholds.
-        seed: of the simulation.
-        spreads: (C,) factors of the energies of the candidates, and of the variances of their sizes, because the
-            parameters of the model are uncertain or the healthy record is noisier than the model.
-        extrapolated: whether the simulation was too short for this ARL0 and the tail was extrapolated.
-        common: largest energy over its threshold that a tenth of the simulated blocks reach; NaN without a simulation.
+    Raises:
+        DataError: fewer inputs than the model has, fewer samples than the window, or a missing one.
     """
-
-    labels: tuple[str, ...]
-    q: Array
-    arl0: float
-    window: int
-    samples: int
-    alarms: int
-    seed: int | None
-    spreads: Array
-    extrapolated: bool = False
-    common: float = float("nan")
-
-    def __str__(self) -> str:
-        """Return the thresholds and the simulation behind them."""
-        tail = ", the tail extrapolated" if self.extrapolated else ""
-        lines = [f"false alarm every {self.arl0:g} samples: {self.alarms} alarms in {self.samples} simulated{tail}"]
-        if not self.samples:
-            lines = ["thresholds as given"]
-        return "\n".join(lines + [f"  {label:<40} {q:7.2f}" for label, q in zip(self.labels, self.q)])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Describe it in JSON types."""
-        return {**self.__dict__, "labels": list(self.labels), "q": [float(q) for q in self.q],
-                "spreads": [float(spread) for spread in self.spreads]}
-
-    @classmethod
-    def from_dict(cls, content: dict[str, Any]) -> "Calibration":
-        """Return the calibration of a description by `to_dict`."""
-        arrays = {word: np.array(content[word], dtype=float) for word in ("q", "spreads")}
-        return cls(**{**content, "labels": tuple(content["labels"]), **arrays})
+    if u is not None:
+        inputs = np.asarray(u, dtype=float).reshape(len(np.asarray(u)), -1)
+        if inputs.shape[1] != model.m or not np.isfinite(inputs).all() or len(inputs) < window:
+            raise DataError(f"u has shape {np.shape(u)}; give {window} samples or more of {model.m} inputs.")
+        return model.expand_inputs(inputs)
+    spans = [(-1.0, 1.0)] * model.m
+    for c, nonlinearity in zip(model.input_of, model.nonlinearities):
+        spans[c] = nonlinearity.basis.interval or spans[c]
+    low, high = np.array(spans).T
+    drawn = np.random.default_rng(seed).uniform(low, high, (INPUTS // HOLD, model.m))
+    return model.expand_inputs(np.repeat(drawn, HOLD, axis=0))
 
 
-def calibrate(
-    search: Window, f: Array, arl0: float, *, samples: int | None = None, seed: int | None = 0,
-    extrapolate: bool = False, effect: Array | None = None,
-) -> Calibration:
-    """Return the thresholds of a search; errors as of `Monitor`.
+def calibrate(search: Window, f: Array, arl0: float, *, samples: int | None = None, seed: int | None = 0,
+              extrapolate: bool = False, effect: Array | None = None) -> Calibration:
+    """Return the thresholds of a search, simulated once in a process; errors as of `Monitor`.
 
     Args:
         search: its candidates, its predictor and its length.
@@ -111,12 +63,18 @@ def calibrate(
     if not (np.isfinite(arl0) and arl0 >= window):
         raise StructureError(f"arl0={arl0!r}: it must be at least the window, {window} samples.")
     wanted = int(min(max(ALARMS * arl0, 200 * window), LONGEST)) if samples is None else int(samples)
-    extrapolated = wanted < FEWEST * arl0
+    extrapolated = wanted < EXCEEDING * arl0
     if extrapolated and not extrapolate:
-        raise DataError(
-            f"{wanted} simulated samples cannot support a false alarm every {arl0:g}: {FEWEST} alarms are needed. "
-            f"Simulate {int(np.ceil(FEWEST * arl0))} samples (samples=), use a lower arl0, or extrapolate the tail "
-            "(extrapolate=True).")
+        raise DataError(f"{wanted} simulated samples cannot support a false alarm every {arl0:g}: {EXCEEDING} alarms "
+                        f"are needed. Simulate {int(np.ceil(EXCEEDING * arl0))} samples (samples=), use a lower arl0, "
+                        "or extrapolate the tail (extrapolate=True).")
+    labels = tuple(c.label for c in columns.candidates)
+    key = hashlib.sha256(repr((labels, float(arl0), seed, window, wanted)).encode())
+    for part in (f, np.array([]) if effect is None else effect, columns.into_state, columns.into_output,
+                 columns.course, *(part for pair in columns.losses for part in pair), *search.matrices):
+        key.update(np.ascontiguousarray(part).tobytes())
+    if known := _KNOWN.get(key.digest()):
+        return known
     l, period = len(steady.C), max(len(f), 1)  # noqa: E741
     length = max(min(CHUNK, wanted) // window, 1) * window
     count = max(1, -(-wanted // (RUNS * length)))
@@ -143,45 +101,13 @@ def calibrate(
         without = list(exact)
     spreads = np.ones(len(columns.size))
     if without:
-        spreads = np.maximum(np.quantile(largest, 1 - COMMON, axis=0) / np.quantile(np.vstack(without), 1 - COMMON,
-                                                                                     axis=0), 1.0)
+        often, exactly = (np.quantile(part, 1 - COMMON, axis=0) for part in (largest, np.vstack(without)))
+        spreads = np.maximum(often / exactly, 1.0)
     q, alarms = equalised(largest, window, arl0)
-    labels = tuple(c.label for c in columns.candidates)
     common = float(np.quantile(np.max(largest / q, axis=1), 1 - COMMON))
-    return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, spreads, extrapolated,
-                       common)
-
-
-def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
-    """Return thresholds (C,) of equal rates, together 1 / ARL0, and the number of alarms.
-
-    The largest statistics (B, C) are those of blocks of `length` samples.
-    """
-    goal = -np.expm1(-length / arl0)
-    level = goal / largest.shape[1]  # for independent candidates
-    few = goal * len(largest) < 0.9 * FEWEST  # too few to count: this level is conservative
-    for _ in range(30):
-        q = np.array([tail(column, level) for column in largest.T])
-        above = np.any(largest > q, axis=1)
-        alarms, quiet = int(np.sum(above[1:] & ~above[:-1])), int(np.sum(~above[:-1]))
-        share = alarms / max(quiet, 1)  # of the blocks that follow a block without an alarm
-        if few or not alarms or abs(share / goal - 1) < 0.005:
-            break
-        level *= goal / share
-    return q, alarms
-
-
-def tail(column: Array, level: float) -> float:
-    """Return the statistic that a share `level` of the blocks exceeds, from an exponential tail where they are few."""
-    count = len(column)
-    ordered = np.sort(column)
-    exceed = level * count
-    base = min(count // 10, max(500, int(4 * exceed)))
-    if exceed >= 500 or base < 20:
-        return float(np.quantile(ordered, 1 - level))
-    start = ordered[count - base - 1]
-    scale = float(np.mean(ordered[count - base :] - start))
-    return float(start + scale * np.log(base / exceed))
+    _KNOWN[key.digest()] = Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, spreads,
+                                       extrapolated, common)
+    return _KNOWN[key.digest()]
 
 
 def cusum_arl(shift: float, k: float = 0.5, h: float = 5.0, *, two_sided: bool = True) -> float:

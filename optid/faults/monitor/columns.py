@@ -13,8 +13,7 @@ from optid.models import HammersteinSS
 
 Matrices = tuple[Array, ...]  # transition, output, gain and root of the search
 
-SPARE = 8
-"""Carried directions that the search has room for, beside twice the widest candidate."""
+SPARE = 8  # carried directions that the search has room for, beside twice the widest candidate
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,8 @@ import numpy as np
 
 from optid.errors import ModelFileError
 from optid.faults.curvature import Products
-from optid.faults.monitor.arl import Calibration
+from optid.faults.false_alarms import Calibration
 from optid.faults.monitor.columns import Window
-from optid.faults.monitor.decisions import Decisions
 from optid.faults.monitor.events import Carried
 from optid.faults.monitor.running_filter import Direction, RunningFilter
 from optid.faults.monitor.sizes import Recent
@@ -18,8 +17,7 @@ from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Predictor
 from optid.models.files import from_content, read_state, write_state
 
-VERSION = 6
-"""Version of the file."""
+VERSION = 6  # version of the file
 
 WORDS = "name", "kind", "columns", "members", "places", "bounded_deflection", "zero"
 PLACES = "into_state", "into_output"
@@ -35,13 +33,14 @@ def _parts(monitor: Any) -> dict[str, tuple[Any, tuple[str, ...]]]:
 def save(monitor: Any, path: str | Path) -> Path:
     """Write dictionary, thresholds and state atomically."""
     found, plant, decisions = monitor.dictionary, monitor.plant, monitor.decisions
+    decided = {name: getattr(part, name) for part in (decisions, decisions.limits) for name in part.KEPT}
     head = {
         "model": found.model.to_dict(), "candidates": [{w: getattr(c, w) for w in WORDS} for c in found.candidates],
         "excluded": dict(found.excluded), "unknown": found.unknown, "window": monitor.window, "seed": monitor.seed,
         "calibration": monitor.calibration.to_dict(),
         "rules": {**decisions.rules, "odd": min(decisions.rules["odd"], 1e300)},
         "source": monitor.source, "samples": monitor.samples, "remark": monitor.remark,
-        "decisions": {name: getattr(decisions, name) for name in Decisions.KEPT}
+        "decisions": {name: [*value.items()] if isinstance(value, dict) else value for name, value in decided.items()}
         | {"testable": decisions.testable.tolist()},
         "readings": monitor.checks.memory, "certain": plant.certain, "silent": found.predictor.silent,
         "directions": [vars(one) | {"deviation": np.ravel(one.deviation).tolist()} for one in plant.directions],
@@ -72,13 +71,16 @@ def _recent(recent: Recent) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _known(head: dict[str, Any], arrays: dict[str, np.ndarray], functions: dict[str, Any] | None) -> ModelUncertainty:
     """The model by which the last samples are judged."""
-    model = from_content(head["model"], functions)
-    parts: dict[str, Any] = {name: arrays[f"known_{name}"] for name in PREDICTOR}
-    ends = head["curvature"]
+    model, ends, levels = from_content(head["model"], functions), head["curvature"], head["levels"]
     curvature = None if ends is None else Products(np.array(ends[0]), np.array(ends[1]), model.m)
-    return ModelUncertainty(model, Predictor(**parts, silent=int(head["silent"])), arrays["known_deviations"],
-                            head["readings"], head["inflation"],
-                            None if head["levels"] is None else np.array(head["levels"]), head["deviation"], curvature)
+    levels = None if levels is None else np.array(levels)
+    return ModelUncertainty(model, _predictor("known", head, arrays), arrays["known_deviations"], head["readings"],
+                            head["inflation"], levels, head["deviation"], curvature)
+
+
+def _predictor(word: str, head: dict[str, Any], arrays: dict[str, np.ndarray]) -> Predictor:
+    parts: dict[str, Any] = {name: arrays[f"{word}_{name}"] for name in PREDICTOR}
+    return Predictor(**parts, silent=int(head["silent"]))
 
 
 def load(monitor: Any, path: str | Path, functions: dict[str, Any] | None = None) -> None:
@@ -95,10 +97,8 @@ def load(monitor: Any, path: str | Path, functions: dict[str, Any] | None = None
             words: dict[str, Any] = {word: tuple(v) if isinstance(v, list) else v for word, v in c.items()}
             candidates.append(Candidate(**words, into_state=arrays[f"into_state_{i}"],
                                         into_output=arrays[f"into_output_{i}"]))
-        parts: dict[str, Any] = {name: arrays[f"predictor_{name}"] for name in PREDICTOR}
-        steady = Predictor(**parts, silent=int(head["silent"]))
-        found = Dictionary(from_content(head["model"], functions), steady, tuple(candidates), head["excluded"],
-                           arrays["sines"], head["unknown"])
+        found = Dictionary(from_content(head["model"], functions), _predictor("predictor", head, arrays),
+                           tuple(candidates), head["excluded"], arrays["sines"], head["unknown"])
         known = _known(head["known"], arrays, functions) if "known" in head else None
         monitor._set(found, head["window"], head["seed"], head["rules"], known)
         if monitor.recent is not None:
@@ -116,8 +116,10 @@ def load(monitor: Any, path: str | Path, functions: dict[str, Any] | None = None
         monitor.checks.memory = head["readings"]
         monitor._use(monitor.calibration)
         monitor.decisions.testable = np.array(head["decisions"]["testable"], dtype=bool)
-        for name in Decisions.KEPT:
-            setattr(monitor.decisions, name, head["decisions"][name])
+        for part in (monitor.decisions, monitor.decisions.limits):
+            for name in part.KEPT:
+                kept = head["decisions"][name]
+                setattr(part, name, dict(kept) if isinstance(getattr(part, name), dict) else kept)
     except (KeyError, TypeError, AttributeError, ValueError, IndexError, RecursionError) as error:
         if "functions=" in str(error):
             raise

@@ -1,7 +1,5 @@
-"""The noise of healthy records: its colour, its size, and the thresholds that it requires."""
+"""The noise of healthy records: its colour and its size."""
 
-import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -9,34 +7,21 @@ import numpy as np
 
 from optid.arrays import Array, as_list
 from optid.data.record import Data
-from optid.errors import DataError, DataWarning, StructureError
-from optid.faults.monitor.arl import COMMON, Calibration
-from optid.faults.nuisance import CONFIDENCE, ModelUncertainty
+from optid.errors import DataError, StructureError
+from optid.faults.false_alarms import blocks_of, check_rise
+from optid.faults.nuisance import ModelUncertainty
 from optid.faults.ranges import outside, unsure_since
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import OTHER_SCALE, Predictor, health, whiten
-from optid.models import HammersteinSS, NoiseCovariances
+from optid.models import NoiseCovariances
 from optid.models.experiments import in_units_of
 from optid.phrases import p_equals
 
-FEWEST = 20
-"""Fewest windows of a healthy record."""
-
-ORDERS = 1, 2, 3, 4, 6, 8
-"""Orders of the autoregressions tried for innovations that are not white."""
-
-LONGEST = 3000
-"""Samples of the identification along which the effect of uncertain parameters is simulated."""
-
-
+ORDERS = 1, 2, 3, 4, 6, 8  # orders of the autoregressions tried for innovations that are not white
+LONGEST = 3000  # samples of the identification along which the effect of uncertain parameters is simulated
+# time constant of a filter that follows slow disturbances, as a share of theirs, and their fewest samples
 FOLLOWED, SLOWEST = 1 / 60, 600
-"""Time constant of a filter that follows slow disturbances, as a share of theirs, and their fewest samples."""
-
-RAISED, REFUSED = 3.0, 10.0
-"""Factors by which a healthy record may raise energies: above the first one with a warning, above the second not."""
-
-BLOCK = 100
-"""Samples of the stretches whose energies are compared."""
+BLOCK = 100  # samples of the stretches whose energies are compared
 
 
 def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> tuple[Array, Array]:
@@ -64,8 +49,7 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
             shape = Predictor(steady.A[n:, n:], steady.C[:, n:], np.zeros((len(steady.A) - n, l)), steady.K[n:],
                               steady.covariance, steady.root)
             raw_effect = shape.respond(np.zeros((len(here.y), len(shape.A), raw_effect.shape[2])), raw_effect)
-        effect = raw_effect
-        effects.append(steady.root @ effect)
+        effects.append(steady.root @ raw_effect)
         inputs.append(known.model.expand_inputs(here.u))
     effect = np.concatenate(effects)
     if not known.deviation:
@@ -96,10 +80,10 @@ def with_noise_of(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
     if judged.white and judged.ratio <= OTHER_SCALE and judged.ratio >= 1 / OTHER_SCALE:
         return found, ""
     for o, name in enumerate(found.model.outputs):
-        energies = [_blocks(part.r[:, o] ** 2, BLOCK).mean(axis=1) for part in parts]
+        energies = [blocks_of(part.r[:, o] ** 2, BLOCK).mean(axis=1) for part in parts]
         every = np.concatenate(energies)
         if usual := float(np.median(every)) if every.size else 0.0:
-            _check_rise(float(every.mean()) / usual, f"the energy of the innovations of {name}", energies, usual, BLOCK)
+            check_rise(float(every.mean()) / usual, f"the energy of the innovations of {name}", energies, usual, BLOCK)
     signals = [np.where(part.present, part.innovations, np.nan) for part in parts]
     taps, covariance = _autoregression(signals, (0,) if judged.white else ORDERS)
     said = (f"on the healthy record the innovations are not those of the model (whiteness {p_equals(judged.p_value)}, "
@@ -138,10 +122,8 @@ def without_drift(found: Dictionary, samples: float) -> Dictionary:
 
     The innovations e of the model count as a line that changes slowly, s+ = s + v + a w, v+ = v + b w, and a white rest
     w = e - s. Both poles of the filter are 1 - 1 / (`FOLLOWED` samples): a hundredth, (2 pi `FOLLOWED`)^2, is left of a
-    period of so many samples, and a constant fault is forgotten with the same poles.
-
-    Raises:
-        StructureError: fewer than `SLOWEST` samples.
+    period of so many samples, and a constant fault is forgotten with the same poles. Fewer than `SLOWEST` samples are a
+    `StructureError`.
     """
     if not samples >= SLOWEST:
         raise StructureError(f"drift={samples!r}: slow disturbances must take {SLOWEST} samples at least.")
@@ -169,80 +151,3 @@ def _shaped(found: Dictionary, A_s: Array, C_s: Array, K_s: Array, covariance: A
     predictor = Predictor(A, C, wider.L, K, covariance, np.tril(lower))
     candidates = tuple(replace(c, into_state=padded(c.into_state)) for c in found.candidates)
     return replace(found, model=wider, predictor=predictor, candidates=candidates)
-
-
-def _blocks(values: Array, length: int) -> Array:
-    """Return values (N,) in blocks (N // length, length)."""
-    return values[: len(values) // length * length].reshape(-1, length)
-
-
-def _check_rise(factor: float, what: str, levels: list[Array], usual: float, length: int) -> None:
-    """Report a stretch of a healthy record that hides faults.
-
-    Args:
-        factor: by which the record raises `what`.
-        what: thresholds or energies.
-        levels: those of every block of `length` samples, for each experiment.
-        usual: level of a usual block.
-        length: samples of a block.
-
-    Raises:
-        DataError: a factor above `REFUSED`.
-
-    Warns:
-        DataWarning: a factor above `RAISED`.
-    """
-    if factor <= RAISED:
-        return
-    number = int(np.argmax([one.max(initial=-np.inf) for one in levels]))
-    high = levels[number] > RAISED * usual
-    first = last = int(np.argmax(levels[number]))
-    while first > 0 and high[first - 1]:
-        first -= 1
-    while last + 1 < len(high) and high[last + 1]:
-        last += 1
-    where = f"samples {first * length} to {(last + 1) * length - 1}" + (
-        f" of experiment {number + 1}" if len(levels) > 1 else "")
-    text = (f"The healthy record raises {what} {factor:.1f}-fold, most in {where}: smaller faults stay hidden. If the "
-            "plant was starting up there, moved outside the range of the model, or was faulty, leave these samples out")
-    if factor > REFUSED:
-        raise DataError(f"{text}; else identify a model that describes them.")
-    warnings.warn(text + ".", DataWarning, stacklevel=4)
-
-
-def raise_thresholds(base: Calibration, model: HammersteinSS, healthy: Data, watched: Callable[[Array, Array], Array]
-                     ) -> Calibration:
-    """Return thresholds with no more alarms on a healthy record than are due: those of `base` times a factor.
-
-    A record is rarely long enough for its false-alarm rate to be measured. The factor is one, unless more than a tenth
-    of the windows reach the energies that a tenth of the simulated ones reach, or there are more alarms than in 95 % of
-    records of this length; then it is the ratio of these energies, or the one that leaves so many alarms.
-
-    Args:
-        base: the thresholds of the monitor.
-        model: the model that it uses.
-        healthy: the record.
-        watched: returns the statistics (N, C) along inputs (N, m) and readings (N, l).
-
-    Raises:
-        DataError: a record of fewer than 20 windows; a factor above 10.
-
-    Warns:
-        DataWarning: a factor above 3.
-    """
-    from scipy.special import bdtrik, pdtrik
-
-    window, records = base.window, in_units_of(model, healthy).experiments
-    levels = [_blocks(np.max(watched(part.u, part.y) / base.q, axis=1), window).max(axis=1) for part in records]
-    largest = np.concatenate(levels)
-    if len(largest) < FEWEST:
-        raise DataError(
-            f"The healthy record has {len(largest)} stretches of {window} samples: {FEWEST} are needed for thresholds.")
-    due = sum(len(part.y) for part in records) / base.arl0
-    allowed = min(int(np.ceil(pdtrik(CONFIDENCE, due))), len(largest) - 1)
-    factor = max(1.0, float(np.sort(largest)[-1 - allowed]))
-    if np.sum(largest > base.common) > bdtrik(CONFIDENCE, len(largest), COMMON):
-        factor = max(factor, float(np.quantile(largest, 1 - COMMON)) / base.common)
-    _check_rise(factor, "the thresholds", levels, 1.0, window)
-    return replace(base, q=factor * base.q, spreads=factor * base.spreads,
-                   samples=base.samples + sum(len(part.y) for part in records))

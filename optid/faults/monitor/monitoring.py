@@ -1,11 +1,9 @@
 """The monitor: the search for faults on a stream, sample by sample."""
 
-import hashlib
 import warnings
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,40 +11,29 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
-from optid.faults.kinds import DRIFT
+from optid.faults.diagnosis.diagnosing import KINDS
+from optid.faults.false_alarms import Calibration, given_thresholds, raise_thresholds
 from optid.faults.monitor import file
 from optid.faults.monitor.actuator_kinds import searched
-from optid.faults.monitor.arl import Calibration, calibrate
+from optid.faults.monitor.arl import calibrate, reference_inputs
 from optid.faults.monitor.columns import SPARE, Window, columns_of
 from optid.faults.monitor.decisions import NAMING, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
-from optid.faults.monitor.healthy_noise import parameter_effect, raise_thresholds, with_noise_of, without_drift
+from optid.faults.monitor.healthy_noise import parameter_effect, with_noise_of, without_drift
+from optid.faults.monitor.limits import RULES
 from optid.faults.monitor.readings import ReadingChecks
-from optid.faults.monitor.rules import RULES
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import expand
 from optid.faults.monitor.sizes import Recent
 from optid.faults.nuisance import ModelUncertainty, model_uncertainty, uncertain_start
 from optid.faults.signatures import Dictionary, dictionary
 from optid.identify.recursive.state import as_block
+from optid.models import HammersteinSS
 from optid.models.experiments import state_like
 from optid.models.feedback_tables import tabulate
 
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
-
-KINDS_BY_DEFAULT = ("bias", "loss", "spike")
-
-INPUTS, HOLD = 20_000, 5
-"""Samples of simulated input for the calibration, and samples per level."""
-
-NORMAL = 1.96
-"""Standard deviations of the ends of a 95 % interval."""
-
-BLOCK = 4096
-"""Samples searched at a time."""
-
-_KNOWN: dict[str, Calibration] = {}
+NORMAL = 1.96  # standard deviations of the ends of a 95 % interval
+BLOCK = 4096  # samples searched at a time
 
 
 class Monitor:
@@ -66,12 +53,11 @@ class Monitor:
         source: origin of the stream in JSON types, kept with the state.
     """
 
-    def __init__(
-        self, model: "HammersteinSS", faults: Dictionary | None = None, arl0: float = 10_000, window: int = 100,
-        seed: int | None = 0, thresholds: Any = None, *, x0: Any = "unknown", healthy: Data | None = None,
-        uncertainty: Data | ModelUncertainty | None = None, u: ArrayLike | None = None, samples: int | None = None,
-        extrapolate: bool = False, drift: float | None = None, **rules: float,
-    ) -> None:
+    def __init__(self, model: HammersteinSS, faults: Dictionary | None = None, arl0: float = 10_000, window: int = 100,
+                 seed: int | None = 0, thresholds: Any = None, *, x0: Any = "unknown", healthy: Data | None = None,
+                 uncertainty: Data | ModelUncertainty | None = None, u: ArrayLike | None = None,
+                 samples: int | None = None, extrapolate: bool = False, drift: float | None = None,
+                 **rules: float) -> None:
         """Set up a monitor; the thresholds are simulated unless they are known.
 
         Args:
@@ -102,19 +88,18 @@ class Monitor:
             DataWarning: candidates that a monitor cannot search for; a healthy record with other noise than the model;
                 a model whose parameters are not the most likely ones.
         """
-        found = dictionary(model, kinds=KINDS_BY_DEFAULT) if faults is None else faults
+        found = dictionary(model, kinds=KINDS) if faults is None else faults
         if not found.belongs_to(model):
             raise StructureError("faults: the dictionary belongs to another model; build it from this one.")
         least = 2 * model.nx + 2
         if isinstance(window, bool) or int(window) != window or window < least:
             raise StructureError(f"window={window!r}: it must be at least {least} samples for {model.nx} states.")
-        unknown = set(rules) - set(RULES)
-        if unknown:
+        if unknown := set(rules) - set(RULES):
             raise StructureError(f"{', '.join(sorted(unknown))}: no such argument. Rules: {', '.join(RULES)}.")
         effect, inputs, known, remarks = None, None, uncertainty, []
         if known is not None:
-            silent = found.predictor if found.predictor.silent else None
             if not isinstance(known, ModelUncertainty):
+                silent = found.predictor if found.predictor.silent else None
                 known = model_uncertainty(found.model, known, decoupled=silent)
             found = replace(found, predictor=known.predictor)
             remarks.append(known.remark)
@@ -124,23 +109,26 @@ class Monitor:
         if healthy is not None:
             found, remark = with_noise_of(found, healthy)
             remarks.append(remark)
+        self.remark = " ".join(filter(None, remarks))
         for remark in filter(None, remarks):
             warnings.warn(remark, DataWarning, stacklevel=2)
-        self.remark = " ".join(filter(None, remarks))
         if known is not None and isinstance(uncertainty, Data):
             effect, inputs = parameter_effect(known, uncertainty, found.predictor)
         exact = {"beyond": 1.0, "wrong": 0.0} if known is None else {}  # an exact model has no errors
-        rules = {**RULES, **exact, **rules}
-        self._set(found, int(window), seed, rules | ({} if found.unknown else {"odd": np.inf}),
-                  sized, None if known is None else known.levels)
+        rules = {**RULES, **exact, **rules, **({} if found.unknown else {"odd": np.inf})}
+        self._set(found, int(window), seed, rules, sized, None if known is None else known.levels)
         for c in found.candidates:
             if c.label in self.skipped and not c.is_sensor_gain:  # the gains of sensors are among the kinds by default
                 warnings.warn(f"{c.label} is not monitored: {self.skipped[c.label]}.", DataWarning, stacklevel=2)
         if thresholds is not None:
-            self.calibration = self._given(thresholds, arl0)
+            self.calibration = given_thresholds(thresholds, self.labels, arl0, self.window)
         else:
-            f = self._simulate_reference(u) if inputs is None else inputs
-            self.calibration = self._simulated(f, effect, arl0, samples=samples, extrapolate=extrapolate)
+            if inputs is None:
+                inputs = np.zeros((0, found.model.B.shape[1]))
+                if self.columns.losses:
+                    inputs = reference_inputs(found.model, u, self.window, seed)
+            self.calibration = calibrate(self.search, inputs, arl0, samples=samples, seed=seed, extrapolate=extrapolate,
+                                         effect=effect)
             if healthy is not None:
                 self.calibration = raise_thresholds(self.calibration, found.model, healthy, self.watched)
         self._use(self.calibration)
@@ -160,8 +148,7 @@ class Monitor:
         self.skipped = {
             c.label: "it is detected from the readings in any case" if c.fault_kind.waveform or c.fault_kind.noise else
             "it has no signature that a running search can search for"
-            for c in found.candidates if c.label not in self.labels
-        }
+            for c in found.candidates if c.label not in self.labels}
         model, steady = found.model, found.predictor
         if not model.parts.tables.compiled:
             raise StructureError(
@@ -170,68 +157,18 @@ class Monitor:
         self.search = Window(self.columns, window, model.nx + SPARE + 2 * int(self.columns.size.max()), steady)
         self.plant = RunningFilter(model, steady, self.columns)
         self.checks = ReadingChecks(model, window, levels)
-        self.decisions = Decisions(self.columns, self.labels, np.full(len(chosen), np.inf), np.ones(len(chosen)), rules,
-                                   model.outputs, np.ones(len(chosen), dtype=bool), [], found.candidates)
-        self.samples = 0
-        self.recent = self.decisions.recent = None if known is None else Recent(known, window)
+        self.samples, self.recent = 0, None if known is None else Recent(known, window)
+        self.decisions = Decisions(self.search, self.plant, self.checks.excursion, rules, found.candidates, self.recent)
         self._functions = tabulate(model.nonlinearities)
         self._input_of, self._output_of = (np.array(of, dtype=np.int64) for of in (model.input_of, model.output_of))
 
     def _use(self, found: Calibration) -> None:
         """Decide by a calibration."""
         self.calibration, own = found, self.decisions
-        own.q, own.spreads, own.common = found.q, found.spreads, found.common
+        own.limits.q, own.limits.common, own.spreads = found.q, found.common, found.spreads
         if own.rules["adapt"] > 1 and not np.isfinite(found.common):
             raise StructureError("adapt: thresholds that are given have no simulated windows to compare with; leave "
                                  "either out.")
-
-    def _simulated(self, f: Array, effect: Array | None, arl0: float, **how: Any) -> Calibration:
-        c = self.columns
-        key = hashlib.sha256(repr((self.labels, float(arl0), self.seed, self.window, how)).encode())
-        losses = [part for pair in c.losses for part in pair]
-        for part in (f, np.array([]) if effect is None else effect, c.into_state, c.into_output, c.course, *losses,
-                     *self.search.matrices):
-            key.update(np.ascontiguousarray(part).tobytes())
-        name = key.hexdigest()
-        if name not in _KNOWN:
-            _KNOWN[name] = calibrate(self.search, f, arl0, seed=self.seed, effect=effect, **how)
-        return _KNOWN[name]
-
-    def _given(self, thresholds: Any, arl0: float) -> Calibration:
-        if isinstance(thresholds, Calibration):
-            if thresholds.labels != self.labels or thresholds.window != self.window:
-                raise StructureError(
-                    f"thresholds: they are those of {', '.join(thresholds.labels)} in a window of "
-                    f"{thresholds.window}; this monitor searches for {', '.join(self.labels)} in {self.window}.")
-            return thresholds
-        if isinstance(thresholds, Mapping):
-            missing = [label for label in self.labels if label not in thresholds]
-            if missing:
-                raise StructureError(f"thresholds: none for {', '.join(missing)}.")
-            thresholds = [thresholds[label] for label in self.labels]
-        q = np.array(thresholds, dtype=float)
-        if q.shape != (len(self.labels),) or not np.all(q > 0):
-            raise StructureError(f"thresholds: give one positive number for each of {', '.join(self.labels)}.")
-        return Calibration(self.labels, q, float(arl0), self.window, 0, 0, None, np.ones(len(q)))
-
-    def _simulate_reference(self, u: ArrayLike | None) -> Array:
-        model = self.dictionary.model
-        if not self.columns.losses:
-            return np.zeros((0, model.B.shape[1]))
-        if u is not None:
-            inputs = np.asarray(u, dtype=float).reshape(len(np.asarray(u)), -1)
-            if inputs.shape[1] != model.m or not np.isfinite(inputs).all() or len(inputs) < self.window:
-                raise DataError(
-                    f"u has shape {np.shape(u)}; give {self.window} samples or more of {model.m} inputs.")
-            return model.expand_inputs(inputs)
-        spans = [(-1.0, 1.0)] * model.m
-        for c, nonlinearity in zip(model.input_of, model.nonlinearities):
-            spans[c] = nonlinearity.basis.interval or spans[c]
-        low, high = np.array(spans).T
-        drawn = np.random.default_rng(self.seed).uniform(low, high, (INPUTS // HOLD, model.m))
-        return model.expand_inputs(np.repeat(drawn, HOLD, axis=0))
-
-    # -- samples -------------------------------------------------------------------------------------------------
 
     def step(self, u: ArrayLike, y: ArrayLike) -> list[Event]:
         """Process one sample, (m,) inputs and (l,) readings; NaN is a missing value.
@@ -280,117 +217,82 @@ class Monitor:
         if self.recent is not None:
             self.recent.append(u, y, start)
         stops, events, k = np.append(np.flatnonzero(alone), count), list(screened.events), 0
+        decisions, limits = self.decisions, self.decisions.limits
+        adapts = decisions.rules["adapt"] > 1
         while k < count:
-            self.decisions.forget_range(self.samples - self.window)
-            clean = int(stops[np.searchsorted(stops, k)])
-            if self.decisions.raised:  # the thresholds stay the same up to here
-                clean = min(clean, k + int(self.decisions.raised[0][0]) + self.window + 1 - self.samples)
-            adapts = self.decisions.rules["adapt"] > 1
+            limits.forget_range(self.samples - self.window)
+            clean, due = int(stops[np.searchsorted(stops, k)]), np.inf
+            if limits.raised:  # the thresholds stay the same up to here
+                clean = min(clean, k + int(limits.raised[0][0]) + self.window + 1 - self.samples)
             if adapts:  # at multiples of the window
                 clean = min(clean, k + self.window - self.samples % self.window)
-            due = self._next_final()
-            clean = int(min(clean, k + due - self.samples))
-            if clean > k and self.plant.certain and self.decisions.waiting:
+            if self.recent is not None:
+                due = self.recent.next_final(decisions.onsets, self.samples)
+                clean = int(min(clean, k + due - self.samples))
+            if clean > k and self.plant.certain and decisions.phase == WATCHING and not decisions.passing:
                 k += self._search_block(f[k:clean], fed[k:clean], y[k:clean], events)
-                events += self._adapt() if adapts else []
-                self._keep_sizes(due, events)
-                continue
-            if k in screened.frozen:
-                self._clear_fault(screened.frozen[k])
-            if screened.distance[k] > 1:
-                self.decisions.leave_range(self.samples, float(screened.distance[k]))
-            self._search_sample(f[k], fed[k], y[k], unsure[k], bool(screened.repeating[k]), events)
-            events += self._adapt() if adapts else []
-            self._keep_sizes(due, events)
-            k += 1
+            else:
+                if k in screened.frozen:
+                    self._clear_fault(screened.frozen[k])
+                if screened.distance[k] > 1:
+                    limits.leave_range(self.samples, float(screened.distance[k]))
+                hold = bool(screened.repeating[k])
+                if self.plant.certain and not (np.isnan(y[k]).any() or unsure[k].any()):
+                    self._search_block(f[k : k + 1], fed[k : k + 1], y[k : k + 1], events, hold)
+                else:
+                    self._search_sample(f[k], y[k], unsure[k], events, hold)
+                k += 1
+            if adapts and self.samples % self.window == 0:
+                events += limits.adapt(self.samples - 1, decisions.phase == WATCHING)
+            if self.recent is not None:
+                if self.samples >= due:
+                    self.recent.keep(decisions.onsets, self._estimates(), self.samples)
+                if events and events[-1].ends_fault and events[-1].sample == self.samples - 1:
+                    self.recent.discard(self.samples, decisions.onsets)
         return sorted(events, key=lambda e: e.sample)
 
-    def _search_block(self, f: Array, fed: Array, y: Array, events: list[Event]) -> int:
+    def _search_block(self, f: Array, fed: Array, y: Array, events: list[Event], hold: bool = False) -> int:
         """Search samples by the steady predictor until a decision is due; return their number."""
-        plant, decisions, now = self.plant, self.decisions, self.samples
+        plant = self.plant
         x, r = plant.run(f, fed, y)
         moving = self.columns.signals(np.vstack([plant.before, f[:-1]]), f)
-        done, statistic, weight = self.search.advance(moving, r, decisions.limit)
+        done, statistic, weight = self.search.advance(moving, r, self.decisions.limit)
         plant.x, plant.before = x[done].copy(), f[done - 1].copy()
-        self.samples += done
-        decisions.count_quiet(statistic)
-        last = decisions.judge(self.samples - 1, self.search, plant, self.checks.excursion)
-        events += decisions.excitation(weight if last is None else weight[:-1], now, self.window)
-        events += [] if last is None else [last]
+        self._decide(statistic, weight, events, hold)
         return done
 
-    def _search_sample(self, f: Array, fed: Array, y: Array, unsure: np.ndarray, repeating: bool, events: list[Event]
-                       ) -> None:
-        plant, decisions, now = self.plant, self.decisions, self.samples
-        used = np.where(np.isnan(f), plant.before, f)
-        moving, limit = self.columns.signals(plant.before[None], used[None]), np.full(len(self.labels), np.inf)
-        if plant.certain and not (np.isnan(y).any() or unsure.any()):
-            x, r = plant.run(used[None], fed[None], y[None])
-            plant.x, plant.before = x[1].copy(), used.copy()
-            _, statistic, weight = self.search.advance(moving, r, limit)
-        else:
-            innovation, matrices = plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
-            _, statistic, weight = self.search.advance(moving, innovation[None], limit, matrices,
-                                                       int(np.count_nonzero(matrices[3].any(axis=1))))
-        self.samples += 1
+    def _search_sample(self, f: Array, y: Array, unsure: np.ndarray, events: list[Event], hold: bool) -> None:
+        """Search a sample while more than the noise is uncertain."""
+        used = np.where(np.isnan(f), self.plant.before, f)
+        moving = self.columns.signals(self.plant.before[None], used[None])
+        innovation, matrices = self.plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
+        _, statistic, weight = self.search.advance(moving, innovation[None], self.decisions.limit, matrices,
+                                                   int(np.count_nonzero(matrices[3].any(axis=1))))
         if unsure.any():
-            decisions.begun = now + 1
+            self.decisions.begun = self.samples + 1
+        self._decide(statistic, weight, events, hold)
+
+    def _decide(self, statistic: Array, weight: Array, events: list[Event], hold: bool) -> None:
+        decisions, now = self.decisions, self.samples
+        self.samples += len(statistic)
         decisions.count_quiet(statistic)
-        watching = decisions.phase == WATCHING
-        event = decisions.judge(now, self.search, plant, self.checks.excursion, hold=repeating)
-        if event is not None:
-            events.append(event)
-        elif watching and decisions.phase == WATCHING:
-            events += decisions.excitation(weight, now, self.window)
-
-    def _adapt(self) -> list[Event]:
-        return [] if self.samples % self.window else self.decisions.adapt(self.samples - 1)
-
-    # -- sizes ----------------------------------------------------------------------------------------------------
-
-    def _next_final(self) -> float:
-        """Return the next sample at which the size of a carried fault becomes final."""
-        if self.recent is None:
-            return np.inf
-        last = (self.recent.last(onset) for number, onset in self.decisions.onsets if number not in self.recent.final)
-        return min((sample for sample in last if sample > self.samples), default=np.inf)
-
-    def _keep_sizes(self, due: float, events: list[Event]) -> None:
-        """Keep sizes that are final at this sample, and discard samples with a fault that is over."""
-        recent, onsets = self.recent, {number: onset for number, onset in self.decisions.onsets}
-        if recent is None:
-            return
-        if self.samples >= due:
-            recent.final |= {number: one for number, one in self._estimates().items()
-                             if recent.last(onsets[number]) <= self.samples}
-        if events and events[-1].ends_fault and events[-1].sample == self.samples - 1:
-            recent.discard(self.samples)
-            recent.final = {number: one for number, one in recent.final.items() if number in onsets}
-
-    def _estimates(self) -> dict[int, Carried]:
-        """Return {number of the candidate: the fault} of the carried faults that the last samples show."""
-        if self.recent is None:
-            return {}
-        numbered = {self.decisions.label_of(number): (number, onset) for number, onset in self.decisions.onsets}
-        onsets = {label: onset for label, (_, onset) in numbered.items()}
-        found = self.recent.estimate(onsets, self.dictionary.candidates, self.samples)
-        return {numbered[label][0]: one for label, one in found.items()}
-
-    # -- operators -------------------------------------------------------------------------------------------------
+        watching, last = decisions.phase == WATCHING, decisions.judge(self.samples - 1, hold=hold)
+        if watching:
+            events += decisions.excitation(weight if last is None else weight[:-1], now)
+        events += [] if last is None else [last]
 
     def acknowledge(self) -> None:
         """Discard the alarm, and search again from the next sample on."""
-        self.decisions.forgive(self.search)
+        self.decisions.forgive()
 
     def rebase(self) -> None:
         """Take a new baseline, after a repair: discard the alarm and all carried faults."""
-        plant = self.plant
+        plant, decisions = self.plant, self.decisions
         plant.release(list(range(len(plant.directions))), slice(0, len(plant.held)), self.search)
-        self.decisions.passing, self.decisions.undecided, self.decisions.windows = [], [], []
-        self.decisions.onsets = []
+        for kept in (decisions.passing, decisions.undecided, decisions.onsets, decisions.limits.windows):
+            kept.clear()
         if self.recent is not None:
             self.recent.discard(self.samples)
-            self.recent.final = {}
         self.acknowledge()
         plant.lose()
 
@@ -403,33 +305,41 @@ class Monitor:
     def _clear_fault(self, onset: int) -> None:
         """Discard the effects of a sensor that has been found frozen."""
         if self.decisions.phase != WATCHING and self.search.peak.any() and self.decisions.alarm >= onset:
-            self.decisions.forgive(self.search)
+            self.decisions.forgive()
         self.search.restart()
         self.plant.lose()
+
+    def _estimates(self) -> dict[int, Carried]:
+        """Return {number of the candidate: the fault} of the carried faults that the last samples show."""
+        if self.recent is None:
+            return {}
+        numbers = {self.decisions.label_of(number): number for number in self.decisions.onsets}
+        onsets = {label: self.decisions.onsets[number] for label, number in numbers.items()}
+        found = self.recent.estimate(onsets, self.dictionary.candidates, self.samples)
+        return {numbers[label]: one for label, one in found.items()}
 
     def _expanded(self, u: Array) -> Array:
         model = self.dictionary.model
         if self._functions.compiled:
-            f = np.empty((len(u), model.B.shape[1]))
-            bad = expand(self._functions, self._input_of, u, f)
-            if bad >= 0:
-                raise DataError(f"sample {self.samples + bad}: an input is outside the interval of its basis.")
-            return f
+            return self._values(self._functions, self._input_of, u, "an input is outside the interval of its basis.")
         return np.vstack([model.expand_inputs(u[k : k + 1]) for k in range(len(u))])  # the same digits for any block
 
     def _fed(self, y: Array) -> Array:
-        fed = np.empty((len(y), len(self._output_of)))
-        if fed.size and expand(self.dictionary.model.parts.tables, self._output_of, y, fed) >= 0:
-            raise DataError(f"sample {self.samples}: an output leaves the interval of a feedback basis.")
-        return fed
+        return self._values(self.dictionary.model.parts.tables, self._output_of, y,
+                            "an output leaves the interval of a feedback basis.")
+
+    def _values(self, functions: Any, channels: np.ndarray, signals: Array, refused: str) -> Array:
+        values = np.empty((len(signals), len(channels)))
+        bad = expand(functions, channels, signals, values) if values.size else -1
+        if bad >= 0:
+            raise DataError(f"sample {self.samples + bad}: {refused}")
+        return values
 
     def __str__(self) -> str:
         """Return the thresholds, the samples processed, and the carried faults."""
         lines = [f"{self.samples} samples seen, window {self.window}" + ", in alarm" * self.alarmed]
         lines += [str(self.calibration), *(f"  not monitored: {label}" for label in self.skipped)]
         return "\n".join([*lines, *map(str, self.carried)])
-
-    # -- current state --------------------------------------------------------------------------------------------
 
     @property
     def statistics(self) -> dict[str, float]:
@@ -445,16 +355,11 @@ class Monitor:
     @property
     def carried(self) -> tuple[Carried, ...]:
         """The isolated faults whose effect is compensated."""
-        plant, size, found = self.plant, self.plant.held.copy(), []
-        variance = plant.held_variance.copy()
+        plant, (size, variance), found = self.plant, self.plant.magnitudes(), []
         estimates = self._estimates() | (self.recent.final if self.recent is not None else {})
-        for at, one in enumerate(plant.directions, self.dictionary.model.nx):
-            if self.columns.course[one.column] != DRIFT or one.growth > 0:
-                size[one.column] += plant.x[at]
-                variance[one.column] += plant.P[at, at]
         for number in range(len(self.labels)):
             own, label = self.columns.of(number), self.decisions.label_of(number)
-            if size[own].any() or any(one.owner == number for one in plant.directions):
+            if size[own].any() or plant.rows_of(number):
                 if number in estimates and estimates[number].label == label:
                     found.append(estimates[number])
                     continue
@@ -473,8 +378,6 @@ class Monitor:
     def state(self) -> Array:
         """(n,) expected state before the next sample, carried faults included."""
         return np.array(self.plant.x[: self.dictionary.model.nx])
-
-    # -- files -----------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> Path:
         """Write the state and the thresholds to an npz file, from which `load` continues bit for bit."""

@@ -6,21 +6,15 @@ import numpy as np
 
 from optid.faults.monitor.columns import Window
 from optid.faults.monitor.events import Event
-from optid.faults.monitor.rules import RULES
+from optid.faults.monitor.limits import RULES
 
-FEWEST = 4
-"""Fewest samples of increased noise."""
+FEWEST = 4  # fewest samples of increased noise
 
 
 def noisy_sensor(now: int, window: Window, outputs: tuple[str, ...]) -> Event | None:
     """Return the sensor whose noise has most likely increased; the statistic is twice the log-likelihood gained.
 
     More noise of one sensor increases the whitened innovations along one direction alone.
-
-    Args:
-        now: the last sample.
-        window: of the innovations.
-        outputs: names of the sensors.
     """
     r, root = window.recent(min(int(window.clock[0]), window.length)), window.steady.root
     l, n = r.shape[1], np.arange(1, len(r) + 1)[:, None]  # noqa: E741

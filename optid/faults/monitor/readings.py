@@ -6,16 +6,11 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.faults.monitor.events import Event
-from optid.faults.ranges import known_range, usable_range
+from optid.faults.ranges import BEYOND, by_input, distance, known_range, usable_range
 from optid.faults.readings import SensorChecks
 from optid.models import HammersteinSS
 
-BEYOND = 1.1
-"""Distance from the middle of the range, in half ranges, from which a channel is far outside it; a linear function of
-an input is extrapolated further."""
-
-REMEMBERED = 2
-"""Windows for which excursions are kept."""
+REMEMBERED = 2  # windows for which excursions are kept
 
 
 class Screened(NamedTuple):
@@ -34,7 +29,7 @@ class ReadingChecks:
 
     Attributes:
         model: the plant.
-        low, high: (m,) identified range of the inputs, infinite where none is known.
+        known, usable: (2, m) identified ranges of the inputs, and those over which they are used.
         sensors: the checks of the readings.
         levels: (2, l) lowest and highest readings of the identification; None where they are not known.
         excursions: [channel, first sample, last sample or None] of channels far outside their range.
@@ -42,23 +37,10 @@ class ReadingChecks:
 
     def __init__(self, model: HammersteinSS, window: int, levels: Array | None = None) -> None:
         """Begin a stream; `levels` (2, l) are the lowest and highest readings of the identification, if known."""
-        m, l = model.m, model.l  # noqa: E741
-        self.model, self.window, self.low, self.high = model, window, np.full(m, -np.inf), np.full(m, np.inf)
-        self._lowest, self._highest = self.low.copy(), self.high.copy()
-        for c, low, high, lowest, highest in zip(model.input_of, *known_range(model), *usable_range(model)):
-            self.low[c], self.high[c] = max(self.low[c], low), min(self.high[c], high)
-            self._lowest[c], self._highest[c] = max(self._lowest[c], lowest), min(self._highest[c], highest)
-        self.sensors, self._outside = SensorChecks(l), [-1] * m
+        self.model, self.window, self.levels = model, window, levels
+        self.known, self.usable = by_input(model, known_range(model)), by_input(model, usable_range(model))
+        self.sensors, self._outside = SensorChecks(model.l), [-1] * model.m
         self.excursions: list[Any] = []
-        self._use(levels)
-
-    def _use(self, levels: Array | None) -> None:
-        """Take the ranges of inputs and outputs beyond which a channel is far outside."""
-        l = self.model.l  # noqa: E741
-        low, high = np.full((2, l), np.inf) * [[-1.0], [1.0]] if levels is None else levels
-        ends, self.levels = [_widened(self.low, self.high), _widened(low, high)], levels
-        self._least = np.concatenate([np.fmin(ends[0][0], self._lowest), ends[1][0]])
-        self._most = np.concatenate([np.fmax(ends[0][1], self._highest), ends[1][1]])
 
     @property
     def memory(self) -> dict[str, Any]:
@@ -68,7 +50,7 @@ class ReadingChecks:
 
     @memory.setter
     def memory(self, kept: dict[str, Any]) -> None:
-        self._use(None if kept["levels"] is None else np.array(kept["levels"]))
+        self.levels = None if kept["levels"] is None else np.array(kept["levels"])
         self.sensors.memory, self._outside = {word: kept[word] for word in self.sensors.memory}, kept["outside"]
         self.excursions = kept["excursions"]
 
@@ -79,11 +61,10 @@ class ReadingChecks:
                 return name, first
         return None
 
-    def _follow(self, u: Array, y: Array, start: int) -> None:
-        """Keep the excursions of channels far outside their range."""
-        both, kept = np.hstack([u, y]), []
+    def _follow(self, both: Array, far: np.ndarray, start: int) -> None:
+        """Keep the excursions of channels (T, m + l) that are far outside their range."""
+        kept: list[Any] = []
         names = [f"input:{name}" for name in self.model.inputs] + [f"output:{name}" for name in self.model.outputs]
-        far = np.asarray((both < self._least) | (both > self._most))
         unknown, open_ = np.isnan(both), {one[0]: one for one in self.excursions if one[2] is None}
         for c, name in enumerate(names):
             if not far[:, c].any() and name not in open_:
@@ -101,15 +82,13 @@ class ReadingChecks:
 
     def screen(self, u: Array, y: Array, start: int) -> Screened:
         """Check a block of inputs (T, m) and readings (T, l) that begins at the sample `start` of the stream."""
-        outside, blind = np.asarray((u < self.low) | (u > self.high)), np.asarray(np.isnan(u).any(axis=1))
-        distance = np.ones(len(u))
-        for low, high, values in ((self.low, self.high, u), *([(*self.levels, y)] if self.levels is not None else [])):
-            at, c = np.nonzero((values < low) | (values > high))
-            np.maximum.at(distance, at, np.abs(2 * values[at, c] - low[c] - high[c]) / (high[c] - low[c]))
-        self._follow(u, y, start)
+        outside, unsure = (np.asarray((u < low) | (u > high)) for low, high in (self.known, self.usable))
+        away = np.hstack([distance(u, self.known), distance(y, self.levels)])
+        blind, far = np.asarray(np.isnan(u).any(axis=1)), away > BEYOND
+        far[:, : u.shape[1]] &= unsure  # a linear function of an input is extrapolated further
+        self._follow(np.hstack([u, y]), far, start)
         clean, repeating, findings = self.sensors.screen(y, blind, start)
-        unsure = np.asarray((u < self._lowest) | (u > self._highest) | np.isnan(u))
-        found = Screened(clean, unsure, distance, repeating, [], {})
+        found = Screened(clean, unsure | np.isnan(u), away.max(axis=1), repeating, [], {})
         for c in range(u.shape[1]):
             self._range(c, u[:, c], outside[:, c], start, found.events)
         for one in findings:
@@ -131,15 +110,9 @@ class ReadingChecks:
         for k in range(len(u)):
             if outside[k] and since[c] < 0:
                 since[c] = start + k
-                note = f"{u[k]:.4g} is outside {self.low[c]:.4g} .. {self.high[c]:.4g}, the identified range"
+                low, high = self.known[:, c]
+                note = f"{u[k]:.4g} is outside {low:.4g} .. {high:.4g}, the identified range"
                 events.append(Event("outside", start + k, name, start + k, note=note))
             elif not outside[k] and since[c] >= 0 and not np.isnan(u[k]):
                 events.append(Event("inside", start + k, name, since[c]))
                 since[c] = -1
-
-
-def _widened(low: Array, high: Array) -> tuple[Array, Array]:
-    """Return ranges extended to `BEYOND`; infinite ones, and those of one value, are unlimited."""
-    span = np.subtract(high, low, where=np.isfinite(low) & np.isfinite(high), out=np.full(low.shape, np.inf))
-    room = np.where(span > 0, (BEYOND - 1) / 2 * span, np.inf)
-    return low - room, high + room

@@ -32,11 +32,8 @@ SEEN = 1e-7
 WIDE = 1e10
 """Prior energy of an unknown input in all innovations: with none, a fault of its actuator would have no size at all."""
 
-DOUBLINGS = 24
-"""Doublings of the horizon over which the response to the state is taken."""
-
-CERTAIN = 1e-12
-"""Energy in one innovation below which the state is known."""
+DOUBLINGS = 24  # doublings of the horizon over which the response to the state is taken
+CERTAIN = 1e-12  # energy in one innovation below which the state is known
 
 
 @dataclass(eq=False)
@@ -126,11 +123,8 @@ class RunningFilter:
     def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, Matrices]:
         """Process one sample; return the whitened innovation (l,) and the matrices of the search.
 
-        Args:
-            f: (r,) functions of the inputs.
-            fed: y -> (s,) functions of the outputs.
-            y: (l,) readings, NaN where missing.
-            unsure: (r,) which functions of the inputs are unknown.
+        f (r,) are functions of the inputs, unknown where they are `unsure`, fed returns those (s,) of the outputs, and
+        y (l,) are the readings, NaN where missing.
         """
         model, steady, n, q = self.model, self.steady, self.model.nx, len(self.directions)
         there, lost = np.flatnonzero(~np.isnan(y)), np.where(np.isnan(y), model.L, 0.0)
@@ -253,6 +247,27 @@ class RunningFilter:
         later, _ = self.columns.units(self.before, self.before)
         self.x[: self.model.nx] -= self.held[own] @ later[own]
         self.held[own] = self.held_variance[own] = 0.0
+
+    def rows_of(self, owner: int) -> list[int]:
+        """Return the constants of a candidate."""
+        return [p for p, one in enumerate(self.directions) if one.owner == owner]
+
+    def estimate(self, owner: int) -> tuple[Array, Array]:
+        """Return the magnitudes (d,) of a carried candidate and their covariance."""
+        rows, own = self.rows_of(owner), self.columns.of(owner)
+        at = [self.model.nx + p for p in rows]
+        whole = np.zeros((own.stop - own.start, len(rows)))  # a part may be carried twice, after a repair
+        whole[[self.directions[p].column - own.start for p in rows], range(len(rows))] = 1.0
+        return self.held[own] + whole @ self.x[at], whole @ self.P[np.ix_(at, at)] @ whole.T
+
+    def magnitudes(self) -> tuple[Array, Array]:
+        """Return the magnitudes (D,) that are compensated, held or estimated, and their variances."""
+        size, variance = self.held.copy(), self.held_variance.copy()
+        for at, one in enumerate(self.directions, self.model.nx):
+            if self.columns.course[one.column] != DRIFT or one.growth > 0:
+                size[one.column] += self.x[at]
+                variance[one.column] += self.P[at, at]
+        return size, variance
 
     def fades_after(self, energy: float, faded: float) -> int:
         """Return the samples after which a transient has the energy `faded`."""

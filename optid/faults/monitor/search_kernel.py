@@ -14,8 +14,7 @@ from optid.faults.kinds import DRIFT, DRIVEN, JUMP
 from optid.kernel_cache import cached_njit
 from optid.models.state_kernels import value_and_slope
 
-DEPENDENT = 1e-9
-"""A column with less than this share of its energy beside the columns before it counts as dependent."""
+DEPENDENT = 1e-9  # a column with less than this share of its energy beside the columns before it counts as dependent
 
 
 class Signatures(NamedTuple):

@@ -5,8 +5,9 @@ errors of the model pass for parts of the fault. What is reported is the estimat
 which these errors count. It is final once the samples before the onset are no longer kept.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -26,14 +27,9 @@ from optid.faults.search.scanning import scan
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import whiten
 
-WINDOWS, BEFORE = 5, 1
-"""Windows of samples that are kept, and those of them before an onset that an estimate needs."""
-
-NEAR, MOST = 20, 3
-"""Samples on both sides of an onset that are tried, and the most faults that are estimated together."""
-
-COVERAGE = 0.95
-"""Of the intervals."""
+WINDOWS, BEFORE = 5, 1  # windows of samples that are kept, and those of them before an onset that an estimate needs
+NEAR, MOST = 20, 3  # samples on both sides of an onset that are tried, and the most faults that are estimated together
+COVERAGE = 0.95  # of the intervals
 
 
 class Recent:
@@ -61,23 +57,27 @@ class Recent:
         self.u, self.y = (np.vstack([kept[drop:], new]) for kept, new in ((self.u, u), (self.y, y)))
         self.first += drop
 
-    def discard(self, before: int) -> None:
-        """Discard the samples before one, which show a fault that is over."""
+    def discard(self, before: int, carried: Mapping[int, int] = MappingProxyType({})) -> None:
+        """Discard the samples before one, which show faults that are over, and the sizes of those that are."""
         self.u, self.y = self.u[before - self.first :], self.y[before - self.first :]
         self.first = before
+        self.final = {number: one for number, one in self.final.items() if number in carried}
+
+    def next_final(self, onsets: Mapping[int, int], now: int) -> float:
+        """Return the sample after `now` at which the size of a carried fault, {number: onset}, becomes final next."""
+        last = (self.last(onset) for number, onset in onsets.items() if number not in self.final)
+        return min((sample for sample in last if sample > now), default=np.inf)
+
+    def keep(self, onsets: Mapping[int, int], found: Mapping[int, Carried], now: int) -> None:
+        """Keep the estimates that are final."""
+        self.final |= {number: one for number, one in found.items() if self.last(onsets[number]) <= now}
 
     def last(self, onset: int) -> int:
         """Return the sample before which an estimate of a fault is final."""
         return onset + (WINDOWS - BEFORE) * self.window
 
     def estimate(self, faults: dict[str, int], listed: Sequence[Candidate], now: int) -> dict[str, Carried]:
-        """Return {label: the fault} for {label: onset}, from the samples before `now`; empty where these are unusable.
-
-        Args:
-            faults: that are carried.
-            listed: the candidates of the dictionary.
-            now: number of samples.
-        """
+        """Return {label: the fault} for {label: onset}, from the samples before `now`; empty if unusable."""
         labels = list(faults)
         for found in self._explanations(faults, listed, now):
             if [c.label for c in found.candidates] == labels:

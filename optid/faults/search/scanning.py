@@ -1,34 +1,33 @@
-"""The exact search for one fault (GLR): every candidate at every onset, the best magnitude by least squares."""
+"""The exact search for one fault (GLR): every candidate at every onset, the best magnitude by least squares.
+
+Its thresholds are those of simulated healthy windows.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
-from optid.errors import LookupFailed, StructureError, nearest
-from optid.faults.search.calibration import Thresholds
+from optid.errors import DataError, LookupFailed, StructureError, nearest
+from optid.faults.false_alarms import Thresholds, check_draws, family_thresholds
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
+from optid.models.experiments import samples_of
 from optid.phrases import short
 
-ALIKE = 2e-6
-"""One less the squared cosine of two signatures below which they are indistinguishable."""
+ALIKE = 2e-6  # one less the squared cosine of two signatures below which they are indistinguishable
+STRETCHES = 100  # number of sections drawn from a longer input
 
 
 class Magnitude(NamedTuple):
-    """The magnitudes of a fault by least squares.
+    """The magnitudes of a fault by least squares."""
 
-    Attributes:
-        nu: (d,) magnitudes; zero along directions without effect.
-        covariance: (d, d) for this candidate and onset, without the search for the onset.
-    """
-
-    nu: Array
-    covariance: Array
+    nu: Array  # (d,) magnitudes; zero along directions without effect
+    covariance: Array  # (d, d) for this candidate and onset, without the search for the onset
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,34 +72,21 @@ class Scan:
         return float(np.sum(self.whitened.r**2))
 
     def index(self, candidate: Candidate | str) -> int:
-        """Return the row of a candidate.
-
-        Raises:
-            LookupFailed: no such candidate.
-        """
+        """Return the row of a candidate; `LookupFailed`: no such candidate."""
         c = self.dictionary[candidate] if isinstance(candidate, str) else candidate
-        for i, other in enumerate(self.dictionary.candidates):
-            if other is c:
-                return i
+        if here := [i for i, other in enumerate(self.dictionary.candidates) if other is c]:
+            return here[0]
         raise LookupFailed(f"{c.label!r} is not in the dictionary. {nearest(c.label, self.labels)}")
 
     def peak(self, candidate: Candidate | str) -> int:
-        """Return the onset at which a candidate explains most.
-
-        Raises:
-            StructureError: a candidate that is tested nowhere.
-        """
+        """Return the onset at which a candidate explains most; `StructureError`: a candidate that is tested nowhere."""
         c = self.index(candidate)
         if np.isnan(self.statistic[c]).all():
             raise StructureError(f"{self.labels[c]} is tested at no onset of this window: it has no peak.")
         return int(np.nanargmax(self.statistic[c]))
 
     def estimate(self, candidate: Candidate | str, onset: int) -> Magnitude:
-        """Return the magnitudes of a candidate at an onset.
-
-        Raises:
-            StructureError: an onset at which it is not tested.
-        """
+        """Return the magnitudes of a candidate at an onset; `StructureError`: an onset at which it is not tested."""
         c = self.index(candidate)
         if not 0 <= onset < self.statistic.shape[1] or np.isnan(self.statistic[c, onset]):
             raise StructureError(f"{self.labels[c]} is not tested at onset {onset} of this window.")
@@ -121,6 +107,12 @@ class Scan:
         if not 0 <= onset < count:
             raise StructureError(f"onset={onset} lies outside the window of {count} samples.")
         return self.sweep.signature(c, onset)
+
+    def again(self, r: Array) -> "Scan":
+        """Return the search of other innovations (N, l) of the same window."""
+        correlations = self.sweep.correlations(r)
+        statistic = np.where(self.tested, self.sweep.statistic(correlations), np.nan)
+        return replace(self, whitened=replace(self.whitened, r=r), statistic=statistic, correlations=correlations)
 
     def together(self, labels: Sequence[Candidate | str], onsets: Sequence[int]) -> Magnitude:
         """Return the magnitudes of several candidates, one after the other, and their covariance."""
@@ -183,3 +175,40 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
         statistic[:, np.setdiff1d(np.arange(count), chosen)] = np.nan
     inputs = None if u is None else np.asarray(u, dtype=float).reshape(len(whitened.r), -1)
     return Scan(found, whitened, inputs, statistic, prepared, correlations)
+
+
+def thresholds(found: Dictionary, window: int | Whitened, false_alarm: float = 0.01, *, u: ArrayLike | None = None,
+               draws: int = 20_000, seed: int | None = 0) -> Thresholds:
+    """Calibrate the search on simulated healthy windows.
+
+    The thresholds are quantiles of the largest energy over the onsets, at one level for all candidates, such that the
+    family of all candidates and onsets has the given false-alarm probability.
+
+    Args:
+        found: the candidates.
+        window: number of samples N; or a window, whose missing readings and uncertain model are simulated, too.
+        false_alarm: probability that a healthy window exceeds any threshold.
+        u: inputs for losses and stuck actuators: those of the window (N, m), or a longer typical record of them, of
+            which sections are drawn. Without it these candidates are not tested.
+        draws: simulated windows.
+        seed: of the simulation.
+
+    Raises:
+        DataError: too few draws for so rare an alarm, an input that is too short or has a missing sample.
+        StructureError: a probability outside (0, 1), a window that is too short, no candidate with a signature.
+    """
+    check_draws(false_alarm, draws)
+    count = len(window.r) if isinstance(window, Whitened) else int(window)
+    rng, inputs = np.random.default_rng(seed), None if u is None else samples_of(u, "u", found.model.m)
+    if inputs is None or len(inputs) == count:
+        starts: np.ndarray = np.zeros(1, dtype=int)
+    elif len(inputs) < count:
+        raise DataError(f"u has {len(inputs)} samples; it must have at least those of the window, {count}.")
+    else:
+        starts = rng.integers(0, len(inputs) - count + 1, min(STRETCHES, draws))
+    shares = np.diff(draws * np.arange(starts.size + 1) // starts.size)
+    largest: list[Array] = []
+    for start, share in zip(starts, shares):
+        prepared = sweep(found, window, None if inputs is None else inputs[start : start + count])
+        largest += [prepared.largest(windows) for windows in prepared.simulated(int(share), rng)]
+    return Thresholds(found.labels, family_thresholds(np.vstack(largest), false_alarm), false_alarm, count, draws, seed)

@@ -1,6 +1,7 @@
-"""Result of the group-sparse programme: active candidates, and those that are certainly zero.
+"""The group-sparse programme: its atoms, and its result, active candidates and those that are certainly zero.
 
-Its magnitudes are shrunk, and neighbouring onsets share one fault: it selects onsets for the exact search
+The atoms are orthonormal axes of the signature of every candidate at every tested onset. The magnitudes of the result
+are shrunk, and neighbouring onsets share one fault: it selects onsets for the exact search
 (`optid.faults.search.subsets`).
 """
 
@@ -11,31 +12,68 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optid.arrays import Array
-from optid.faults.search.atoms import Atoms
+from optid.errors import StructureError
+from optid.faults.search.scanning import Scan
+from optid.faults.search.sweeps import inverse_roots
 
 if TYPE_CHECKING:
     from optid.core.problem import Problem
+    from optid.faults.false_alarms import Thresholds
     from optid.program.solution import Solution
 
-REACH = 10
-"""Onsets on either side of an active one that are searched exactly, for every candidate."""
+REACH = 10  # onsets on either side of an active one that are searched exactly, for every candidate
+MOST = 40_000_000  # largest number of values of the atoms of a window
+
+
+@dataclass(frozen=True, eq=False)
+class Atoms:
+    """The atoms of one candidate."""
+
+    label: str  # of the candidate
+    onsets: np.ndarray  # (T,) those that are tested
+    axes: Array  # (T, N l, d) orthonormal columns; zero ones for directions without effect
+    back: Array  # (T, d, d) magnitudes = back @ coefficients of the axes
+    threshold: float  # energy q above which the search raises an alarm for the candidate
+
+    @property
+    def dimension(self) -> int:
+        """Number of magnitudes."""
+        return self.axes.shape[2]
+
+
+def atoms_of(found: Scan, limits: "Thresholds") -> tuple[Atoms, ...]:
+    """Return the atoms of every tested candidate, from the search of a window and its thresholds.
+
+    Raises:
+        StructureError: thresholds of other candidates or missing for one that is tested; a window that is too long.
+    """
+    q = limits.of(found.labels, found.tested_anywhere)
+    places = [np.flatnonzero(row) for row in found.tested]
+    columns = sum(where.size * c.dimension for where, c in zip(places, found.dictionary.candidates))
+    if columns * found.whitened.r.size > MOST:
+        raise StructureError(f"{columns} columns of {found.whitened.r.size} readings are too many for a programme over "
+                             "all onsets: use a shorter window, or scan fewer onsets (scan(..., onsets=...)).")
+    made = []
+    for candidate, where, threshold in zip(found.dictionary.candidates, places, q):
+        if not where.size:
+            continue
+        traces = np.stack([found.signature(candidate, int(onset)) for onset in where])
+        flat = traces.reshape(where.size, found.whitened.r.size, -1)
+        products = np.einsum("tkp,tkq->tpq", flat, flat)
+        largest = np.asarray(np.linalg.eigvalsh(products)[:, -1], dtype=float)
+        back = np.swapaxes(inverse_roots(products, largest), 1, 2)
+        made.append(Atoms(candidate.label, where, flat @ back, back, float(threshold)))
+    return tuple(made)
 
 
 @dataclass(frozen=True, eq=False)
 class ActiveGroup:
-    """One active candidate at one onset.
+    """One active candidate at one onset."""
 
-    Attributes:
-        label: of the candidate.
-        onset: first sample that it changes.
-        size: (d,) magnitudes, shrunk by the penalty: not an estimate.
-        deflection: norm of the whitened signature, shrunk, too.
-    """
-
-    label: str
-    onset: int
-    size: Array
-    deflection: float
+    label: str  # of the candidate
+    onset: int  # first sample that it changes
+    size: Array  # (d,) magnitudes, shrunk by the penalty: not an estimate
+    deflection: float  # norm of the whitened signature, shrunk, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,19 +132,12 @@ class SparseResult:
     @property
     def clusters(self) -> tuple[tuple[int, int], ...]:
         """First and last onset of every run of active onsets not more than twice `REACH` apart."""
-        onsets = self.onsets
-        if not onsets.size:
-            return ()
-        cuts = np.flatnonzero(np.diff(onsets) > 2 * REACH)
-        firsts, lasts = onsets[np.concatenate([[0], cuts + 1])], onsets[np.concatenate([cuts, [onsets.size - 1]])]
-        return tuple((int(a), int(b)) for a, b in zip(firsts, lasts))
+        runs = np.split(self.onsets, np.flatnonzero(np.diff(self.onsets) > 2 * REACH) + 1)
+        return tuple((int(run[0]), int(run[-1])) for run in runs if run.size)
 
     def near(self, reach: int = REACH) -> np.ndarray:
         """Return the mask (N,) of the onsets within reach of an active one."""
-        mask = np.zeros(self.count, dtype=bool)
-        for onset in self.onsets:
-            mask[max(onset - reach, 0) : onset + reach + 1] = True
-        return mask
+        return np.any(np.abs(np.arange(self.count)[:, None] - self.onsets) <= reach, axis=1)
 
     @classmethod
     def of(cls, stated: "Problem", solution: "Solution", atoms: Sequence[Atoms], count: int) -> "SparseResult":

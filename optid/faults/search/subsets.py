@@ -20,37 +20,22 @@ from optid.faults.search.scanning import ALIKE, Magnitude, Scan
 from optid.faults.search.sweeps import Sweep
 
 if TYPE_CHECKING:
-    from optid.faults.search.calibration import Thresholds
+    from optid.faults.false_alarms import Thresholds
     from optid.faults.search.pair_kernels import Grams
 
-MOST = 1_250_000_000
-"""Largest number of subsets searched."""
-
-EXCHANGED = 3
-"""Number of subsets improved by exchanges."""
-
-ROUNDS = 20
-"""Largest number of rounds of exchanges."""
-
-
-Member = tuple[int, int]
-"""Number of a candidate and its onset."""
+MOST = 1_250_000_000  # largest number of subsets searched
+EXCHANGED = 3  # number of subsets improved by exchanges
+ROUNDS = 20  # largest number of rounds of exchanges
+Member = tuple[int, int]  # number of a candidate and its onset
 
 
 class Subset(NamedTuple):
-    """A few faults.
+    """A few faults."""
 
-    Attributes:
-        labels: of the candidates, in the order of the dictionary and of the onsets.
-        onsets: of each.
-        gain: energy explained less all thresholds.
-        energy: energy explained.
-    """
-
-    labels: tuple[str, ...]
-    onsets: tuple[int, ...]
-    gain: float
-    energy: float
+    labels: tuple[str, ...]  # of the candidates, in the order of the dictionary and of the onsets
+    onsets: tuple[int, ...]  # of each
+    gain: float  # energy explained less all thresholds
+    energy: float  # energy explained
 
     def __str__(self) -> str:
         """State candidates and onsets."""
@@ -116,9 +101,8 @@ class SubsetSearch:
         return "\n".join(lines)
 
 
-def best_subsets(
-    scan: Scan, thresholds: "Thresholds", *, max_faults: int = 2, near: np.ndarray | None = None
-) -> SubsetSearch:
+def best_subsets(scan: Scan, thresholds: "Thresholds", *, max_faults: int = 2,
+                 near: np.ndarray | None = None) -> SubsetSearch:
     """Search a window for up to `max_faults` faults, exactly: all subsets of candidates and onsets (F3, F4).
 
     Both of two faults may be of one candidate, as a fault that comes and goes.
@@ -140,10 +124,9 @@ def best_subsets(
     number = int(tested.sum())
     subsets = sum(comb(number, k) for k in range(1, max_faults + 1))
     if subsets > MOST:
-        raise StructureError(
-            f"{number} candidates and onsets make {subsets:.2g} subsets of up to {max_faults} faults: too many for an "
-            "exact search. Use fewer faults, a shorter window, or scan fewer onsets (scan(..., onsets=...)), such as "
-            "those near the active ones of the sparse method.")
+        raise StructureError(f"{number} candidates and onsets make {subsets:.2g} subsets of up to {max_faults} faults: "
+                             "too many for an exact search. Use fewer faults, a shorter window, or scan fewer onsets "
+                             "(scan(..., onsets=...)), such as those near the active ones of the sparse method.")
     columns, best, alike = _Columns.of(scan, q), _Best(), 0
     for size in range(1, min(max_faults, number) + 1):
         found = columns.best(size, tested)
@@ -152,17 +135,14 @@ def best_subsets(
     if near is not None and not near.all():
         for gain, members in best.ranked[:EXCHANGED]:
             best.offer(*exchange_search(members, gain, columns.best_beside))
-    ranked = []
-    for gain, members in best.ranked:
-        names, onsets = zip(*((scan.labels[c], k) for c, k in members))
-        ranked.append(Subset(names, onsets, gain, gain + float(sum(q[c] for c, _ in members))))
+    ranked = [Subset(tuple(scan.labels[c] for c, _ in members), tuple(k for _, k in members), gain,
+                     gain + float(sum(q[c] for c, _ in members))) for gain, members in best.ranked]
     searched = np.asarray(tested.any(axis=0)) if near is None else near
     return SubsetSearch(scan, tuple(ranked), searched, subsets, alike)
 
 
-def exchange_search(
-    members: Sequence[Member], gain: float, best_beside: Callable[[Sequence[Member]], tuple[float, Member]]
-) -> tuple[float, list[Member]]:
+def exchange_search(members: Sequence[Member], gain: float,
+                    best_beside: Callable[[Sequence[Member]], tuple[float, Member]]) -> tuple[float, list[Member]]:
     """Return the gain and the members that no single exchange improves, from members of some gain.
 
     `best_beside` returns the best member beside some others, and the gain of all of them.

@@ -25,72 +25,43 @@ from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened
 from optid.models.experiments import samples_of
 
-SHARE = 1e-9
-"""Directions of a signature with less than this share of the energy of the largest one explain nothing."""
-
-BATCH = 2_000_000
-"""Numbers of a batch of simulated windows."""
-
-SMALL = 10_000
-"""Products of columns up to which a single run takes less time than to compile it."""
+SHARE = 1e-9  # directions of a signature with less than this share of the energy of the largest one explain nothing
+BATCH = 2_000_000  # numbers of a batch of simulated windows
+SMALL = 10_000  # products of columns up to which a single run takes less time than to compile it
 
 
 class SweepTables(NamedTuple):
-    """Input of the kernels of `optid.faults.search.sweep_kernels`.
+    """Input of the kernels of `optid.faults.search.sweep_kernels`."""
 
-    Attributes:
-        of: (N,) which of the T tables governs a sample.
-        F: (T, n, n) transition of the error of the predictor.
-        C: (l, n).
-        W: (T, l, l) whitening, lower triangular; zero rows and columns where a reading is missing.
-        h: (T, l, D) additions of the columns to the innovation.
-        e: (T, n, D) their additions to the state of the next sample.
-        lasting: number of columns that last, which come first.
-        drifts: number of drifts, which follow; the others are jumps.
-        helpers: index of the helper of the first drift.
-        group: (D,) candidate of every column, helpers included.
-        first: (C,) first column of every candidate.
-        sizes: (C,) number of its columns; 0 for a candidate without a signature.
-        places: (C,) where its inverse roots begin in a row of `Sweep.roots`.
-    """
-
-    of: np.ndarray
-    F: Array
-    C: Array
-    W: Array
-    h: Array
-    e: Array
-    lasting: int
-    drifts: int
-    helpers: int
-    group: np.ndarray
-    first: np.ndarray
-    sizes: np.ndarray
-    places: np.ndarray
+    of: np.ndarray  # (N,) which of the T tables governs a sample
+    F: Array  # (T, n, n) transition of the error of the predictor
+    C: Array  # (l, n)
+    W: Array  # (T, l, l) whitening, lower triangular; zero rows and columns where a reading is missing
+    h: Array  # (T, l, D) additions of the columns to the innovation
+    e: Array  # (T, n, D) their additions to the state of the next sample
+    lasting: int  # number of columns that last, which come first
+    drifts: int  # number of drifts, which follow; the others are jumps
+    helpers: int  # index of the helper of the first drift
+    group: np.ndarray  # (D,) candidate of every column, helpers included
+    first: np.ndarray  # (C,) first column of every candidate
+    sizes: np.ndarray  # (C,) number of its columns; 0 for a candidate without a signature
+    places: np.ndarray  # (C,) where its inverse roots begin in a row of `Sweep.roots`
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """The search for one fault, ready for windows of one length, pattern of missing readings and input.
+    """The search for one fault, ready for windows of one length, pattern of missing readings and input."""
 
-    Attributes:
-        found: the dictionary.
-        white: a window like those to be searched: its predictor, missing readings, uncertain model and states.
-        u: (N, m) inputs; None where they were not given.
-        tables: of the recursions and of the columns.
-        roots: (N, R) inverse roots of the products, row by row and candidate after candidate; zero rows for directions
-            that have no effect.
-        tested: (C, N) whether the candidate is tested at the onset.
-        along: V (N, q, D): an uncertain model, and axes projected out, take V' V off the products of the columns; q is
-            zero without them.
-    """
-
-    found: Dictionary
-    white: Whitened
-    u: Array | None
-    tables: SweepTables
+    found: Dictionary  # the dictionary
+    white: Whitened  # a window like those to be searched: its predictor, missing readings, uncertain model and states
+    u: Array | None  # (N, m) inputs; None where they were not given
+    tables: SweepTables  # of the recursions and of the columns
+    # (N, R) inverse roots of the products, row by row and candidate after candidate; zero rows for directions that have
+    # no effect
     roots: Array
-    tested: np.ndarray
+    tested: np.ndarray  # (C, N) whether the candidate is tested at the onset
+    # V (N, q, D): an uncertain model, and axes projected out, take V' V off the products of the columns; q is zero
+    # without them
     along: Array
 
     @property
@@ -212,15 +183,12 @@ def sweep(found: Dictionary, window: int | Whitened, u: Any = None) -> Sweep:
     states = None if inputs is None else white.states
     able = tuple(
         c.additive or bool(c.columns) and inputs is not None or c.schedule is not None and states is not None
-        for c in found.candidates
-    )
+        for c in found.candidates)
     if states is not None and len(states) != count and any(c.schedule for c in found.candidates):
         raise DataError(f"The states have {len(states)} samples; the window has {count}: cut them like the rest.")
     if not any(able):
-        raise StructureError(
-            "No candidate has a signature: add the kind 'bias', 'drift' or a state jump, or pass the input u for "
-            "losses and stuck actuators."
-        )
+        raise StructureError("No candidate has a signature: add the kind 'bias', 'drift' or a state jump, or pass the "
+                             "input u for losses and stuck actuators.")
     driven = any(a and not c.additive for c, a in zip(found.candidates, able))
     if driven or white.nuisance is not None or not white.present.all():
         return _prepared(found, white, inputs, able)
@@ -242,14 +210,11 @@ def _inputs(found: Dictionary, u: Any, window: int) -> Array:
     if bad.any():
         k, c = np.argwhere(bad)[0]
         raise DataError(
-            f"Input {found.model.inputs[c]!r} is missing at sample {k}: the signature of a loss requires every input."
-        )
+            f"Input {found.model.inputs[c]!r} is missing at sample {k}: the signature of a loss requires every input.")
     return inputs
 
 
-def _prepared(
-    found: Dictionary, white: Whitened, u: Array | None, able: tuple[bool, ...], once: bool = False
-) -> Sweep:
+def _prepared(found: Dictionary, white: Whitened, u: Array | None, able: tuple[bool, ...], once: bool = False) -> Sweep:
     from optid.faults.search.sweep_kernels import correlate, grams
 
     tables, window, nuisance = _tables(found, white, u, able), len(white.r), white.nuisance
@@ -306,8 +271,7 @@ def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[boo
     line = lasting + drifts + drifts + jumps  # the helpers of the drifts are the last of the columns that last
     into = [
         found.additions(c, window, 0, u) if c.columns else (c.into_state[None], c.into_output[None])
-        for c in (candidates[i] for i in line)
-    ]
+        for c in (candidates[i] for i in line)]
     if not all(candidates[i].additive for i in line):
         into = [tuple(np.broadcast_to(part, (window, *part.shape[1:])) for part in pair) for pair in into]
         gains, whitening, of = gains[of], whitening[of], np.arange(window)

@@ -147,8 +147,6 @@ def rank_test(statistics: HankelStatistics, regression: RegressionRows, *, rows:
         StructureError: windows no longer than `rows`, positions beyond them, a level not between 0 and 1.
         RankError: too few windows, or instruments that do not reach the regressors.
     """
-    from scipy.special import chdtrc, chdtri
-
     if statistics.rows <= rows:
         raise StructureError(f"The windows have {statistics.rows} block rows and {rows} are used: take windows that "
                              "are longer by the number of future block rows.")
@@ -179,9 +177,8 @@ def rank_test(statistics: HankelStatistics, regression: RegressionRows, *, rows:
         if mean <= 0 or variance <= 0:
             p_values[n0] = 1.0 if values[n0] <= floor else 0.0
             continue
-        g, h = variance / (2 * mean), 2 * mean**2 / variance
-        thresholds[n0] = unit * g / j * chdtri(h, level)
-        p_values[n0] = chdtrc(h, tails[n0] / unit * j / g)
+        quantile, p_values[n0] = quantile_of_sum(mean, variance, level, tails[n0] / unit * j)
+        thresholds[n0] = unit * quantile / j
     return RankTest(values, tails, expected, thresholds, p_values, floor, level, j,
                     values.size if largest is None else largest)
 
@@ -236,3 +233,14 @@ def moments_of_sum(covariance_e: Sequence[Array], covariance_z: Sequence[Array])
         if mean > 0.1 * traces[0] and variance > 0.01 * products[0, 0]:
             break
     return mean, variance
+
+
+def quantile_of_sum(mean: float, variance: float, level: float, statistic: float) -> tuple[float, float]:
+    """Return what a sum of squares of these moments exceeds with the probability `level`, and how often a statistic.
+
+    It is nearly g times chi-square with h degrees of freedom, which have the same moments.
+    """
+    from scipy.special import chdtrc, chdtri
+
+    g, h = variance / (2 * mean), 2 * mean**2 / variance
+    return float(g * chdtri(h, level)), float(chdtrc(h, statistic / g))

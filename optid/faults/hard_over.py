@@ -15,8 +15,9 @@ one window later. Open loop is assumed: under feedback inputs depend on sensor n
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +25,10 @@ from numpy.typing import NDArray
 from optid.arrays import Array, check_integer, check_probability, one_of
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.order.ranks import RankTest, lagged_covariances, moments_of_sum, rank_test
+from optid.identify.order.ranks import RankTest, lagged_covariances, moments_of_sum, quantile_of_sum, rank_test
+from optid.models import HammersteinSS
+from optid.phrases import short
 from optid.statistics.hankel import HankelStatistics, RegressionRows, hankel_statistics
-
-if TYPE_CHECKING:
-    from optid.models.hammerstein_ss import HammersteinSS
 
 BLOCK_ROWS = 6
 LONG = 20  # windows have at least this many samples per future row of outputs
@@ -52,7 +52,7 @@ class ChannelRegression(NamedTuple):
 class ZeroTest:
     """Test of one group of coefficients on one window."""
 
-    name: str  # the channel, for instance "sensor:y1"
+    name: str  # the channel
     statistic: float = float("nan")  # T, without unit; NaN where the window has too few samples
     threshold: float = float("nan")  # quantile of T if the coefficients are zero
     p_value: float = float("nan")  # probability of a larger T if they are zero
@@ -180,8 +180,7 @@ class HardOver:
 
     def __str__(self) -> str:
         """Print the first four channels of every window, and what was found."""
-        names = [test.name for test in self.windows[0].tests[:4]]
-        shown = "".join(f"{name if len(name) <= 13 else name[:12] + '.':>14}" for name in names)
+        shown = "".join(f"{short(test.name, 13):>14}" for test in self.windows[0].tests[:4])
         lines = ["statistic / threshold of each channel; up to 1 is dead, - is untestable",
                  f"{'samples':<15}{'order':>6}{shown}"]
         for verdict in self.windows:
@@ -191,11 +190,9 @@ class HardOver:
         return "\n".join([*lines, *wrap(self.explain(), 80)])
 
 
-def hard_over_test(
-    data: Data, healthy: Data, *, model: "HammersteinSS | None" = None, order: int | None = None,
-    window: int | None = None, hop: int | None = None, block_rows: int = BLOCK_ROWS, instruments: str = "inputs",
-    level: float = LEVEL, white_sensors: bool = True,
-) -> HardOver:
+def hard_over_test(data: Data, healthy: Data, *, model: HammersteinSS | None = None, order: int | None = None,
+                   window: int | None = None, hop: int | None = None, block_rows: int = BLOCK_ROWS,
+                   instruments: str = "inputs", level: float = LEVEL, white_sensors: bool = True) -> HardOver:
     """Test a record for dead sensors and actuators, window by window.
 
     Args:
@@ -242,7 +239,7 @@ def hard_over_test(
 class _Tests:
     """The tests of windows of 3 alpha samples of the signals [f(u) | y], compared with a healthy record."""
 
-    def __init__(self, healthy: Data, model: "HammersteinSS | None", alpha: int, instruments: str, level: float,
+    def __init__(self, healthy: Data, model: HammersteinSS | None, alpha: int, instruments: str, level: float,
                  order: int | None) -> None:
         if model is not None and model.feedback:
             raise StructureError("The model feeds outputs back: this test is for plants in open loop.")
@@ -250,10 +247,10 @@ class _Tests:
             raise DataError(f"the model has channels {', '.join((*model.inputs, *model.outputs))}, the record others.")
         self.model, self.alpha, self.level = model, alpha, level
         self.input_of = range(healthy.m) if model is None else model.input_of
-        places: list[Any] = np.split(np.arange(len(self.input_of) + healthy.l), [len(self.input_of)])
-        self.u, self.y = places
-        self.sensors, self.actuators = ([f"{place}:{c}" for c in names] for place, names in
-                                        (("sensor", healthy.outputs), ("actuator", healthy.inputs)))
+        self.u: Any = np.arange(len(self.input_of))
+        self.y: Any = len(self.input_of) + np.arange(healthy.l)
+        self.sensors = [f"sensor:{c}" for c in healthy.outputs]
+        self.actuators = [f"actuator:{c}" for c in healthy.inputs]
         statistics = hankel_statistics(self.signals(healthy), 3 * alpha, centre="mean")
         statistics.check()
         at, past, future = statistics.at, range(alpha), range(alpha, 2 * alpha)
@@ -261,8 +258,8 @@ class _Tests:
         self.regression = RegressionRows(
             np.r_[0, self.inputs, at(self.y if instruments == "inputs+past" else [], past)],
             np.r_[0, at(self.u, future)], at(self.y, future))
-        mean = statistics.gram[0] / statistics.windows
-        self.sizes = np.sqrt(np.maximum(np.diag(statistics.gram) / statistics.windows - mean**2, 0))
+        moments = statistics.gram / statistics.windows
+        self.sizes = np.sqrt(np.maximum(np.diag(moments) - moments[0]**2, 0))
         for channel, size in zip((*(healthy.inputs[i] for i in self.input_of), *healthy.outputs), self.sizes[1:]):
             if not size > 0:
                 raise RankError(f"{channel} is constant in the healthy record: use one in which every channel varies.")
@@ -272,12 +269,11 @@ class _Tests:
                             f"eigenvalue {self.excited:.1e}): use richer inputs or fewer block rows.")
         self.order = self.rank(statistics, LEVEL).order if order is None else order
         self.outputs, self.healthy = coefficients(statistics, self.regression), dict[str, Array]()
-        rows, columns, _ = self.channel_tests(statistics)
-        self.healthy = {test.name: test.coefficients for test in (*rows, *columns)}
+        self.healthy = {test.name: test.coefficients for tests in self.channel_tests(statistics)[:2] for test in tests}
 
     def signals(self, data: Data) -> list[Array]:
-        return [np.hstack([e.u if self.model is None else self.model.expand_inputs(e.u),
-                           e.y]) for e in data.experiments]
+        return [np.hstack([e.u if self.model is None else self.model.expand_inputs(e.u), e.y])
+                for e in data.experiments]
 
     def judge(self, record: Array, place: tuple[int, int, int]) -> WindowVerdict:
         try:
@@ -303,9 +299,8 @@ class _Tests:
 
     def excitation(self, statistics: HankelStatistics) -> float:
         """Smallest eigenvalue of the covariance of the inputs, in units of their healthy sizes."""
-        at = self.inputs
-        mean = statistics.gram[0, at] / statistics.windows
-        covariance = statistics.gram[np.ix_(at, at)] / statistics.windows - np.outer(mean, mean)
+        at, moments = self.inputs, statistics.gram / statistics.windows
+        covariance = moments[np.ix_(at, at)] - np.outer(moments[0, at], moments[0, at])
         return max(float(np.linalg.eigvalsh(covariance / np.outer(self.sizes[at], self.sizes[at]))[0]), 0.0)
 
     def rank(self, statistics: HankelStatistics, level: float) -> RankTest:
@@ -317,15 +312,11 @@ class _Tests:
         """Row tests, column tests, and the sensors whose output is autocorrelated."""
         alpha, at, rows, columns, moving = self.alpha, statistics.at, [], [], set()
         past, future, now, until = range(alpha), range(alpha, 2 * alpha), [alpha], range(alpha + 1)
-
-        def test(regression: ChannelRegression, healthy: Array | None) -> ZeroTest:
-            return zero_test(statistics, regression, rows=2 * alpha, level=self.level,
-                             scale=self.sizes[regression.outputs], healthy=healthy)
-
+        test = partial(zero_test, statistics, rows=2 * alpha, level=self.level, scale=self.sizes)
         for s, name in zip(self.y, self.sensors):
             rows.append(test(ChannelRegression(name, self.inputs, np.array([0]), at([s], future)),
-                             self.healthy.get(name)))
-            own = test(ChannelRegression(name, at([s], past), np.r_[0, self.inputs], at([s], now)), None)
+                             healthy=self.healthy.get(name)))
+            own = test(ChannelRegression(name, at([s], past), np.r_[0, self.inputs], at([s], now)))
             moving |= {name} if own.statistic > own.threshold else set()
         seen = [i for i, row in enumerate(rows) if not row.flat]  # a constant sensor shows no actuator
         for j, name in enumerate(self.actuators):
@@ -335,21 +326,17 @@ class _Tests:
             mine, healthy = np.equal(self.input_of, j), self.healthy[name][:, seen] if self.healthy else None
             others = np.r_[0, at(self.u[~mine], until), at(self.y, past)]
             regression = ChannelRegression(name, at(self.u[mine], until), others, at(self.y[seen], now))
-            columns.append(test(regression, healthy))
+            columns.append(test(regression, healthy=healthy))
         return tuple(rows), tuple(columns), frozenset(moving)
 
 
-def zero_test(
-    statistics: HankelStatistics, regression: ChannelRegression, *, rows: int, level: float,
-    scale: Array | None = None, healthy: Array | None = None,
-) -> ZeroTest:
+def zero_test(statistics: HankelStatistics, regression: ChannelRegression, *, rows: int, level: float,
+              scale: Array | None = None, healthy: Array | None = None) -> ZeroTest:
     """Test whether the coefficients of y on t are zero, given o, from the moments of windows of `rows` + reach samples.
 
-    t and o lie within the first `rows` block rows. The scale (y,) is that of the healthy outputs, and `healthy` (t, y)
-    are the coefficients of a healthy record.
+    t and o lie within the first `rows` block rows. The scale is that of all healthy signals, and `healthy` (t, y) are
+    the coefficients of a healthy record.
     """
-    from scipy.special import chdtrc, chdtri
-
     _, t, o, y = regression
     j, width = statistics.windows, 1 + rows * statistics.d
     gram = statistics.gram[:width, :width] / j
@@ -361,7 +348,7 @@ def zero_test(
     weights[o] -= past
     left, on_t = weights.T @ gram @ weights, weights[:, : t.size]
     variances = np.diag(left)[t.size :]
-    spread = np.maximum(np.sqrt(np.maximum(variances, 0)) if scale is None else scale, 1e-150)
+    spread = np.maximum(np.sqrt(np.maximum(variances, 0)) if scale is None else scale[y], 1e-150)
     values, vectors = np.linalg.eigh(left[: t.size, : t.size])
     kept = values > DROPPED * t.size
     values, vectors = values[kept], vectors[:, kept]
@@ -383,8 +370,8 @@ def zero_test(
         found = replace(found, healthy=mean / j + float(np.sum(gained**2)))
     if mean <= 0 or variance <= 0:  # residuals are rounding: any coefficient counts
         return replace(found, threshold=0.0, p_value=float(found.statistic == 0))
-    g, h = variance / (2 * mean), 2 * mean**2 / variance
-    return replace(found, threshold=float(g / j * chdtri(h, level)), p_value=float(chdtrc(h, found.statistic * j / g)))
+    quantile, p_value = quantile_of_sum(mean, variance, level, found.statistic * j)
+    return replace(found, threshold=quantile / j, p_value=p_value)
 
 
 def coefficients(statistics: HankelStatistics, regression: RegressionRows) -> Array:
@@ -395,9 +382,8 @@ def coefficients(statistics: HankelStatistics, regression: RegressionRows) -> Ar
     return np.linalg.lstsq(triangle[:size, :size] / scale, triangle[:size, size:], rcond=1e-13)[0].T / scale
 
 
-def least_order(
-    statistics: HankelStatistics, regression: RegressionRows, healthy: Array, test: RankTest, order: int, scale: Array,
-) -> int:
+def least_order(statistics: HankelStatistics, regression: RegressionRows, healthy: Array, test: RankTest, order: int,
+                scale: Array) -> int:
     """Return the smallest order that a healthy plant, of this order and with Pi (y, z), may show on a window.
 
     Its outputs are Pi times the instruments and noise, so that Pi L11 Q2 is R22 of the window without noise. An order

@@ -1,1 +1,0 @@
-"""Complete failures by rank deficiency (chapter 7)."""
