@@ -409,8 +409,7 @@ def test_damaged_files_are_read_or_refused_by_name(save, kind, count):
     for bad in bytes_of(path.read_bytes(), count, seed=4):
         path.write_bytes(bad)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DataWarning)
+            with warnings.catch_warnings(action="ignore", category=DataWarning):
                 read(path, *([1, 2] if kind == "to file" else []))
         except DataError as error:
             assert "r.mat" in str(error) or "channel" in str(error), error

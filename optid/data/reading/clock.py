@@ -69,26 +69,17 @@ class NoStamps(UnreadStamps):
 
 @dataclass(frozen=True)
 class TimeColumn:
-    """How the stamps of a record are read from its columns.
+    """How the stamps of a record are read from its columns."""
 
-    Attributes:
-        columns: the column, or those of the date and of the time of day.
-        kind: "numbers", "digits" (numbers that spell dates), "dates" (text), "times of day" (text) or "ready" (dates or
-            durations already).
-        scale: seconds in a unit of numbers.
-        origin: number of 1970-01-01; None where the numbers count from an unknown instant.
-        forms: format of each column of text.
-        how: format of the table.
-        finding: what was recognised and is worth saying.
-    """
-
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # the column, or those of the date and of the time of day
+    # "numbers", "digits" (numbers that spell dates), "dates" (text), "times of day" (text) or "ready" (dates or
+    # durations already)
     kind: str
-    how: Format
-    scale: float = 1.0
-    origin: float | None = None
-    forms: tuple[str, ...] = ()
-    finding: str = ""
+    how: Format  # format of the table
+    scale: float = 1.0  # seconds in a unit of numbers
+    origin: float | None = None  # number of 1970-01-01; None where the numbers count from an unknown instant
+    forms: tuple[str, ...] = ()  # format of each column of text
+    finding: str = ""  # what was recognised and is worth saying
 
     def stamps(self, block: Mapping[str, Any], label: str) -> np.ndarray:
         """Return the stamps (N,) of a block: seconds as float64, or dates and durations in nanoseconds; NaN or NaT.

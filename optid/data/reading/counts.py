@@ -41,17 +41,11 @@ DIGITS = {8: "%Y%m%d", 10: "%Y%m%d%H", 12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}
 
 @dataclass(frozen=True)
 class Meaning:
-    """What the numbers of a clock mean.
+    """What the numbers of a clock mean."""
 
-    Attributes:
-        scale: seconds in their unit.
-        origin: number of 1970-01-01; None where they count from an unknown instant.
-        finding: what is worth saying; empty where they are seconds.
-    """
-
-    scale: float = 1.0
-    origin: float | None = None
-    finding: str = ""
+    scale: float = 1.0  # seconds in their unit
+    origin: float | None = None  # number of 1970-01-01; None where they count from an unknown instant
+    finding: str = ""  # what is worth saying; empty where they are seconds
 
 
 def meaning(values: np.ndarray, name: str, base: str, unit: str, word: str | None, where: str) -> Meaning:
