@@ -172,8 +172,7 @@ def serve(source: BenchSource, port: int = 0, ready: Callable[[str, Path], None]
     except (OSError, OverflowError) as error:
         raise DataError(f"port {port} of 127.0.0.1 cannot be used: "
                         f"{getattr(error, 'strerror', 'it must be 0 to 65535')}") from None
-    with server, TemporaryDirectory(prefix="optid-") as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with server, TemporaryDirectory(prefix="optid-") as folder, warnings.catch_warnings(action="ignore"):
         ready(server.address, server.redirect(Path(folder)))
         try:
             server.serve_forever()

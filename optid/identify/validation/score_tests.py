@@ -48,17 +48,11 @@ class FTest:
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """The rows of a regression, one array per experiment.
+    """The rows of a regression, one array per experiment."""
 
-    Attributes:
-        present: rows that count, (N,).
-        nuisance: columns (N, q) that are projected out of every experiment by itself.
-        noise: polynomial [1, a1, ...] that whitens the errors.
-    """
-
-    present: tuple[NDArray[np.bool_], ...]
-    nuisance: tuple[Array, ...]
-    noise: Array
+    present: tuple[NDArray[np.bool_], ...]  # rows that count, (N,)
+    nuisance: tuple[Array, ...]  # columns (N, q) that are projected out of every experiment by itself
+    noise: Array  # polynomial [1, a1, ...] that whitens the errors
 
     @cached_property
     def _parts(self) -> list[tuple[NDArray[np.bool_], Array]]:
