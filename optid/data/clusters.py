@@ -31,12 +31,9 @@ SOURCES = ("optid", "formulations")
 def connect_cluster(scheduler: Any) -> Iterator[Any]:
     """Give a `distributed.Client` whose workers run the same versions as this process.
 
-    Args:
-        scheduler: address ("tcp://host:8786", "host:8786"), path of a scheduler file (.json), or an open Client, which
-            stays open; for a cluster with certificates open the Client yourself.
-
-    Raises:
-        ClusterError: Dask is not installed, no scheduler at the address, no worker, or workers with other versions.
+    The scheduler is an address ("tcp://host:8786", "host:8786"), the path of a scheduler file (.json), or an open
+    Client, which stays open; for a cluster with certificates open the Client yourself. `ClusterError`: Dask is not
+    installed, no scheduler at the address, no worker, or workers with other versions.
     """
     try:
         from distributed import Client

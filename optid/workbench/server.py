@@ -157,15 +157,10 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def serve(source: BenchSource, port: int = 0, ready: Callable[[str, Path], None] = print) -> None:
-    """Serve a record until it is interrupted.
+    """Serve a record on a port of 127.0.0.1, by default a free one, until it is interrupted.
 
-    Args:
-        source: the record.
-        port: of 127.0.0.1; any free one by default.
-        ready: called with the address, and with a file, readable by this user only, that redirects to it.
-
-    Raises:
-        DataError: the port is in use, or is not a port.
+    `ready` gets the address, and a file, readable by this user only, that redirects to it. `DataError`: the port is in
+    use, or is not a port.
     """
     try:
         server = Server(source, port)

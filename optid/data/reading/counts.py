@@ -51,16 +51,8 @@ class Meaning:
 def meaning(values: np.ndarray, name: str, base: str, unit: str, word: str | None, where: str) -> Meaning:
     """Return what the numbers (N,) of a clock mean, by their size, their spacing and the name of the column.
 
-    Args:
-        values: the numbers, finite.
-        name: of the column, for findings.
-        base: the name without its unit, in lower case.
-        unit: unit that the name or the source tells, a key of `UNITS`, or "".
-        word: a key of `COUNTS` that the user gave.
-        where: source and column, for errors.
-
-    Raises:
-        DataError: numbers that are dates in digits, or whose size contradicts the unit of their name.
+    `base` is that name without its unit, in lower case; `unit` a key of `UNITS` or "", `word` a key of `COUNTS` that
+    the user gave. `DataError`: numbers that are dates in digits, or whose size contradicts the unit of their name.
     """
     if word is not None:
         return Meaning(COUNTS[word].scale, COUNTS[word].zero, f"clock {name!r}: {COUNTS[word].about}")

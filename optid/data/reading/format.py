@@ -125,6 +125,10 @@ class Format:
         word = cell.strip().lower()
         return word in MISSING or word in self.marks
 
+    def is_comment(self, line: str) -> bool:
+        """Whether a line is a comment."""
+        return self.comment is not None and line.lstrip().startswith(self.comment)
+
     @cached_property
     def marks(self) -> frozenset[str]:
         """The further words of missing samples, in lower case."""

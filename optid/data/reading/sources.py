@@ -106,7 +106,7 @@ def open_tables(source: Any, how: Format) -> list[RawTable]:
 
 def _file_tables(path: Path, kind: str, how: Format) -> list[RawTable]:
     if kind in TEXT:
-        file = open_csv(path, replace(how, delimiter="\t") if kind == ".tsv" and not how.delimiter else how)
+        file = open_csv(path, how)
         return [RawTable(path.name, file.names, file.columns, file.layout.how, None, file.layout.dates,
                          file.layout.units, advice=file.layout.advice, hints=file.layout.hints,
                          findings=file.layout.findings)]
@@ -130,24 +130,9 @@ def _file_tables(path: Path, kind: str, how: Format) -> list[RawTable]:
 
         return [replace(_of_frame(one.label, one.frame, how), units=one.units, findings=one.findings)
                 for one in plant_tables(path, kind)]
-    return [_of_mat(path, how)]
+    from optid.data.reading.matlab import mat_table
 
-
-def _of_mat(path: Path, how: Format) -> RawTable:
-    from optid.data.reading.matlab import mat_contents, split_experiments
-
-    contents = mat_contents(path)
-    names = list(contents.experiments[0])
-    if not set(names) - contents.refused.keys():
-        reasons = " ".join(f"{name!r} {reason}" for name, reason in list(contents.refused.items())[:3])
-        raise DataError(f"{path.name} holds no arrays of numbers. {reasons}".rstrip())
-
-    def split(signals: Sequence[str], time: Any) -> list[RawTable]:
-        return [RawTable(one.label, one.names, one.load, how, one.index, units=contents.units, step=one.step)
-                for one in split_experiments(path, contents, signals, time)]
-
-    return RawTable(path.name, names, lambda wanted, _: mat_contents(path, wanted).experiments[0], how, split=split,
-                    inputs=contents.inputs or None, outputs=contents.outputs or None)
+    return [mat_table(path, how)]
 
 
 def _of_frame(label: str, frame: Any, how: Format) -> RawTable:
@@ -248,7 +233,7 @@ def open_source(source: Any, chunk: int, how: Format) -> Source:
         whole = Part(path.name, partial(parquet_blocks, path, None, chunk), rows)
         return Source(names, rows, whole, lambda _: parquet_parts(path, chunk), path.name, how, dates)
     if kind in TEXT:
-        file = open_csv(path, replace(how, delimiter="\t") if kind == ".tsv" and not how.delimiter else how)
+        file = open_csv(path, how)
         found = _of_files(file.names, how, Part(path.name, partial(file.blocks, chunk)), path)
         return replace(found, how=file.layout.how, dates=file.layout.dates, units=file.layout.units,
                        findings=file.layout.findings)
