@@ -16,7 +16,8 @@ from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format, is_number
 from optid.data.reading.rival_clocks import settle
 from optid.data.reading.runs import RawRun, cut_between, join_continued, sample_evenly
-from optid.data.reading.sources import RawTable, open_tables
+from optid.data.reading.sources import open_tables
+from optid.data.reading.tables import RawTable
 from optid.data.record import Data, Experiment
 from optid.data.streams import Stream, open_stream
 from optid.errors import DataError

@@ -10,7 +10,7 @@ import numpy as np
 from optid.data.reading.clock import is_time_name
 from optid.data.reading.format import Format
 from optid.data.reading.mat_contents import MatContents, file_contents
-from optid.data.reading.sources import RawTable
+from optid.data.reading.tables import RawTable
 from optid.errors import DataError
 from optid.processes import run_apart
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from optid.data.reading.clock import NoStamps, TimeColumn, over_midnight, recognise, seconds
-from optid.data.reading.sources import RawTable, Source
+from optid.data.reading.tables import RawTable, Source
 from optid.data.reading.uniform import COARSE, share_of_repeats
 from optid.errors import DataError
 
