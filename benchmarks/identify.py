@@ -35,7 +35,7 @@ from search_plants import LIKENESSES, ORDINARY, record
 import optid
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks, pooled_fit
-from optid.identify.lag_sums import LagSums, linear, scan
+from optid.identify.lag_sums import LagSums, scan
 from optid.identify.search import identify
 from optid.identify.validation.predictions import prediction_fit
 
@@ -192,7 +192,7 @@ def sums() -> None:
     y = np.convolve(u, 0.9 ** np.arange(60))[:20_000] + rng.normal(size=20_000)
     blocks = Blocks.of(optid.Data(u, y))
     clock = time.process_time()
-    found = scan(LagSums(blocks, linear(blocks.data)), [(0,)])
+    found = scan(LagSums(blocks), [(0,)])
     exact = time.process_time() - clock
     clock = time.process_time()
     for one in found[:8]:

@@ -25,7 +25,7 @@ from optid.core.terms import NuclearNorms, Squares
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.identify.equation_error import EquationError, pose_with_loss
-from optid.identify.gauges import Gauge
+from optid.models.gauges import Gauge
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 

@@ -4,8 +4,8 @@ Each function takes the seed of all that is random and the number of samples n, 
 noise relative to the root of the power of the noise-free output, in place of the ratio that they state.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ def heater(seed: int = 0, n: int = 1500) -> Example:
     u = np.round(signals.uniform_levels(n, 0.0, 100.0, hold=25, seed=seed))
     u[:25], u[25:50] = 0.0, 100.0
     pole = np.exp(-5.0 / 120.0)
-    clean = 20.0 + _filter(np.r_[np.zeros(5), 1.0 - pole], np.array([-pole]), _limited(u))
+    clean = 20.0 + lfilter(np.r_[np.zeros(5), 1.0 - pole], np.array([1.0, -pole]), _limited(u))
     data = Data(u, np.round(clean + 0.3 * rng.standard_normal(n), 2), 5.0, inputs="heater", outputs="temperature",
                 input_units="%", output_units="degC", name="heater", start="2024-03-01T08:00")
     suggestion = {"formulation_name": "hammerstein_oe.exact", "na": 1, "nb": 1, "nk": 5, "basis": "triangular:10",
@@ -65,7 +65,7 @@ def dead_zone(seed: int = 0, n: int = 1000, noise: float | None = None) -> Examp
     rng = np.random.default_rng(seed)
     u = rng.uniform(-1.0, 1.0, n)
     variance_of_f = 0.75**3 / 3  # integral of (|u| - 0.25)^2 over the density 1/2, f has zero mean
-    power = variance_of_f * _energy(_DEAD_ZONE.b[0], _DEAD_ZONE.a)
+    power = variance_of_f * _DEAD_ZONE.energy(_DEAD_ZONE.b[0])
     return _DEAD_ZONE.example(u[:, None], 22, noise, rng, power)
 
 
@@ -91,8 +91,8 @@ def broken_thruster(seed: int = 0, n: int = 400) -> Example:
     rng = np.random.default_rng([seed, 2])
     u = _currents(n, seed + 1)
     left = np.where(np.arange(n) < 5 * n // 8, 1.0, 0.5)
-    whole = _filter(_THRUSTER.b[0], _THRUSTER.a, left * _thrust(u[:, 0]))
-    data = _THRUSTER.data(u, whole + _THRUSTER.noise(thruster(seed).truth["sigma"], n, rng), "broken_thruster")
+    whole = _THRUSTER.filter(_THRUSTER.b[0], left * _thrust(u[:, 0]))
+    data = _THRUSTER.data(u, whole, thruster(seed).truth["sigma"], rng.standard_normal(n), "broken_thruster")
     truth = {"f": (_thrust,), "noise_free": whole[:, None], "onset": 5 * n // 8, "lost": 0.5}
     return Example(data, truth, dict(_THRUSTER.suggestion))
 
@@ -109,29 +109,37 @@ def two_inputs(seed: int = 0, n: int = 2000, noise: float | None = None) -> Exam
     return _TWO_INPUTS.example(u, 25, noise, rng)
 
 
-def pendulum(seed: int = 0, n: int = 4000) -> Example:
+def pendulum(seed: int = 0, n: int = 4000, noise: float | None = None) -> Example:
     """Return a simulated reaction wheel pendulum: motor command to angle and wheel speed.
 
-    Dead zone, friction, an encoder of 4000 counts and noise on the speed; uniform levels within 8, held five samples
-    of 0.02 s (`optid.plants.pendulum`). Gravity and friction are nonlinear feedback of the outputs.
+    Dead zone, friction, an encoder of 4000 counts (a perfect one where the noise is zero) and noise on the speed;
+    uniform levels within 8, held five samples of 0.02 s (`optid.plants.pendulum`). Gravity and friction are nonlinear
+    feedback of the outputs.
     """
     u = plants.pendulum_input("levels", n, seed)
     plant = plants.ReactionWheelPendulum()
-    truth = {"n": 3, "f": (plant.torque,), "noise_free": plant.states(u)[:, [0, 2]]}
-    suggestion = {"na": 3, "nb": 2, "nk": 1, "basis": "polynomial:4", "nx": 3, "feedback_basis": "polynomial:4"}
-    return Example(plants.pendulum(u, seed), truth, suggestion)
+    states = plant.states(u)
+    sizes: dict[str, Any] = {} if noise is None else {"measurement": noise * float(np.std(states[:, 2]))}
+    sizes |= {"quantum": 0.0} if noise == 0 else {}
+    return Example(plants.pendulum(u, seed, **sizes), {"n": 3, "f": (plant.torque,), "noise_free": states[:, [0, 2]]},
+                   fed_back(3))
 
 
-def vanderpol(seed: int = 0, n: int = 6000) -> Example:
+def vanderpol(seed: int = 0, n: int = 6000, noise: float | None = None) -> Example:
     """Return a simulated Van der Pol oscillator driven through f(u) = u + 0.5 u |u|.
 
-    White uniform input within 2, dt = 0.1 s, process noise 0.005, measurement noise 0.02 (`optid.plants.van_der_pol`).
-    The cubic damping is nonlinear feedback of the measured output.
+    White uniform input within 2, dt = 0.1 s, measurement noise 0.02 and process noise a quarter of it
+    (`optid.plants.van_der_pol`). The cubic damping is nonlinear feedback of the measured output.
     """
     u = np.random.default_rng([seed, 1]).uniform(-2.0, 2.0, n)
-    data = plants.van_der_pol(u, seed, process=0.005, measurement=0.02)
-    suggestion = {"na": 2, "nb": 2, "nk": 1, "basis": "polynomial:4", "nx": 2, "feedback_basis": "polynomial:4"}
-    return Example(data, {"n": 2, "f": (plants.van_der_pol_drive,)}, suggestion)
+    size = 0.02 if noise is None else noise * float(np.std(plants.van_der_pol(u).y))
+    data = plants.van_der_pol(u, seed, process=size / 4, measurement=size)
+    return Example(data, {"n": 2, "f": (plants.van_der_pol_drive,)}, fed_back(2))
+
+
+def fed_back(order: int) -> dict[str, Any]:
+    """Return the arguments that suit a plant of an order with nonlinear feedback of its outputs."""
+    return {"na": order, "nb": 2, "nk": 1, "basis": "polynomial:4", "nx": order, "feedback_basis": "polynomial:4"}
 
 
 def two_tanks(seed: int = 0, n: int = 600) -> Example:
@@ -167,31 +175,42 @@ def example(name: str, **arguments: Any) -> Example:
 
 
 @dataclass(frozen=True, eq=False)
-class _System:
-    """A Hammerstein-ARX system with the names of its channels and the arguments to fit it with."""
+class HammersteinSystem:
+    """A y = sum_c B_c f_c(u_c) + C e, from rest, with the names of its channels and the arguments to fit it with.
 
-    name: str
-    dt: float
-    inputs: dict[str, str]  # name: unit
-    outputs: dict[str, str]
-    a: np.ndarray
+    With C = 1 the noise is an equation error, with C = A white noise at the output.
+    """
+
+    a: np.ndarray  # (na,) behind the leading one
     b: tuple[np.ndarray, ...]
     f: tuple[Callable[[np.ndarray], np.ndarray], ...]
-    suggestion: dict[str, Any]
+    c: np.ndarray = field(default_factory=lambda: np.ones(1))
+    dt: float = 0.1
+    inputs: Mapping[str, str] = field(default_factory=lambda: {"u": ""})  # name: unit
+    outputs: Mapping[str, str] = field(default_factory=lambda: {"y": ""})
+    name: str = ""
+    suggestion: Mapping[str, Any] = field(default_factory=dict)
+
+    def filter(self, b: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return B / A of x (N,)."""
+        return lfilter(b, np.concatenate([[1.0], self.a]), x)
+
+    def impulse(self, b: np.ndarray, count: int = 200) -> np.ndarray:
+        """Return so many samples of the impulse response of B / A."""
+        return self.filter(b, np.eye(1, count)[0])
+
+    def energy(self, b: np.ndarray, count: int = 2000) -> float:
+        """Return the energy of so many samples of it, the variance gain of B / A for white inputs."""
+        return float(np.sum(self.impulse(b, count) ** 2))
 
     def output(self, u: np.ndarray) -> np.ndarray:
-        """Return the noise-free output (N,) to the inputs (N, m), from rest."""
-        return np.sum([_filter(b, self.a, f(x)) for b, f, x in zip(self.b, self.f, u.T)], axis=0)
+        """Return the noise-free output (N,) to the inputs (N, m)."""
+        return np.sum([self.filter(b, f(x)) for b, f, x in zip(self.b, self.f, u.T)], axis=0)
 
-    def noise(self, sigma: float, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Return output noise e / A (n,), with e of standard deviation sigma."""
-        return _filter(np.ones(1), self.a, sigma * rng.standard_normal(n))
-
-    def data(self, u: np.ndarray, y: np.ndarray, name: str = "") -> Data:
-        """Return a record with the names and units of the channels."""
-        return Data(u, y, self.dt, inputs=list(self.inputs), outputs=list(self.outputs),
-                    input_units=list(self.inputs.values()), output_units=list(self.outputs.values()),
-                    name=name or self.name)
+    def data(self, u: np.ndarray, clean: np.ndarray, sigma: float, e: np.ndarray, name: str = "") -> Data:
+        """Return the record of inputs (N, m), noise-free outputs (N,) and white noise e (N,) of deviation sigma."""
+        return Data(u, clean + self.filter(sigma * self.c, e), self.dt, list(self.inputs), list(self.outputs),
+                    list(self.inputs.values()), list(self.outputs.values()), name or self.name)
 
     def example(self, u: np.ndarray, ratio: float, noise: float | None, rng: np.random.Generator,
                 power: float | None = None) -> Example:
@@ -202,10 +221,10 @@ class _System:
         clean = self.output(u)
         power = float(np.var(clean)) if power is None else power
         wanted = power / ratio if noise is None else power * noise**2
-        sigma = float(np.sqrt(wanted / _energy(np.ones(1), self.a)))
+        sigma = float(np.sqrt(wanted / self.energy(self.c)))
         truth = {"a": self.a.copy(), "b": tuple(b.copy() for b in self.b), "f": self.f, "sigma": sigma,
                  "noise_free": clean[:, None]}
-        return Example(self.data(u, clean + self.noise(sigma, len(u), rng)), truth, dict(self.suggestion))
+        return Example(self.data(u, clean, sigma, rng.standard_normal(len(u))), truth, dict(self.suggestion))
 
 
 def _currents(n: int, seed: int) -> np.ndarray:
@@ -213,15 +232,6 @@ def _currents(n: int, seed: int) -> np.ndarray:
     staircase = signals.steps(n, -1.2, 1.2, levels=9, hold=12)
     ripple = signals.multisine(n, -0.5, 0.5, dt=0.1, band=(0.0, 2.0), phases="random", seed=seed)
     return np.clip(staircase + ripple, -1.5, 1.5)[:, None]
-
-
-def _filter(b: np.ndarray, a: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return lfilter(b, np.concatenate([[1.0], a]), x)
-
-
-def _energy(b: np.ndarray, a: np.ndarray) -> float:
-    """Return the energy of the impulse response of B / A, its variance gain for white inputs."""
-    return float(np.sum(_filter(b, a, np.eye(1, 2000)[0]) ** 2))
 
 
 def _dead_band(u: np.ndarray) -> np.ndarray:
@@ -244,19 +254,20 @@ def _thrust(u: np.ndarray) -> np.ndarray:
     return np.where(np.abs(u) < 0.1, 0.0, np.where(u > 0, 1.0, 0.7) * u * np.abs(u))
 
 
-_DEAD_ZONE = _System(
-    "dead_zone", 0.1, {"u": ""}, {"y": ""}, np.array([-1.5, 0.7]), (np.array([16 / 15, 0.8]),), (_dead_band,),
-    {"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8", "constraints": ["monotone:increasing"]})
+_DEAD_ZONE = HammersteinSystem(
+    np.array([-1.5, 0.7]), (np.array([16 / 15, 0.8]),), (_dead_band,), name="dead_zone",
+    suggestion={"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8", "constraints": ["monotone:increasing"]})
 
-_THRUSTER = _System(
-    "thruster", 0.1, {"current": "A"}, {"thrust": "N"}, np.array([-1.2, 0.4]), (np.array([0.2]),), (_thrust,),
-    {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:10", "constraints": ["monotone:increasing"]})
+_THRUSTER = HammersteinSystem(
+    np.array([-1.2, 0.4]), (np.array([0.2]),), (_thrust,), inputs={"current": "A"}, outputs={"thrust": "N"},
+    name="thruster",
+    suggestion={"na": 2, "nb": 1, "nk": 0, "basis": "triangular:10", "constraints": ["monotone:increasing"]})
 
-_TWO_INPUTS = _System(
-    "two_inputs", 1.0, {"valve": "", "heater": "V"}, {"temperature": "K"}, np.array([-1.1, 0.3]),
-    (np.array([-0.6, -0.3]), np.array([0.5, 0.4])), (_saturation, _power),
-    {"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8",
-     "constraints": ["monotone:decreasing,channel=valve", "monotone:increasing,channel=heater"]})
+_TWO_INPUTS = HammersteinSystem(
+    np.array([-1.1, 0.3]), (np.array([-0.6, -0.3]), np.array([0.5, 0.4])), (_saturation, _power), dt=1.0,
+    inputs={"valve": "", "heater": "V"}, outputs={"temperature": "K"}, name="two_inputs",
+    suggestion={"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8",
+                "constraints": ["monotone:decreasing,channel=valve", "monotone:increasing,channel=heater"]})
 
 
 __dir__ = public_names(__name__)

@@ -30,14 +30,11 @@ class Basis:
         interval: (lower, upper) in units of the input; None until `with_interval`.
         outside: what happens beyond the interval: "clamp" (f stays at its end value), "linear" (it goes on straight),
             "extrapolate" (its formula goes on) or "error".
-        shape_exact: True when the rows of `increments`, `curvature` and `slope_rows` are necessary and sufficient on
-            the whole interval.
         dropped: index of the function left out of a complete family that sums to one; None when nothing is redundant.
     """
 
     interval: tuple[float, float] | None
     outside: Outside
-    shape_exact: Any = False
     dropped: Any = None
     _sizes: ClassVar[dict[str, tuple[int, str]]] = {}  # integer fields: least value, and what they count
 

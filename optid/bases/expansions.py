@@ -122,7 +122,6 @@ class Linear(Basis):
 
     interval: tuple[float, float] | None = None
     outside: Outside = "extrapolate"
-    shape_exact = True
 
     @property
     def full_size(self) -> int:

@@ -22,7 +22,6 @@ class _Splines(Basis):
 
     p: int
     degree: Any
-    shape_exact = True
 
     @property
     def full_size(self) -> int:
@@ -182,11 +181,6 @@ class BSpline(_Splines):
     interval: tuple[float, float] | None = None
     outside: Outside = "clamp"
     _sizes = {"p": (1, "cells"), "degree": (1, "degrees of a B-spline")}
-
-    @property
-    def shape_exact(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """True up to degree 2."""
-        return self.degree <= 2
 
 
 def _not_vanishing(x: Array, knots: Array, degree: int) -> tuple[NDArray[np.int32], Array]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.arrays import is_number
 from optid.errors import DataError, OptidError
 
 TURNS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}  # characters that turn the direction of text
@@ -117,12 +118,12 @@ class Channel:
         return cls(name, unit, role, low, high, mean, std, count_levels(here), 1.0 - here.size / x.size)
 
 
-def count_levels(x: np.ndarray, most: int = MOST_LEVELS) -> int:
-    """Count the distinct values of x (N,); counting stops above `most`, so that long records stay cheap."""
+def count_levels(x: np.ndarray) -> int:
+    """Count the distinct values of x (N,); counting stops above `MOST_LEVELS`, so that long records stay cheap."""
     seen = np.empty(0)
     for first in range(0, x.size, 65536):
         seen = np.union1d(seen, x[first : first + 65536])
-        if seen.size > most:
+        if seen.size > MOST_LEVELS:
             break
     return int(seen.size)
 
@@ -185,7 +186,7 @@ def check_texts(what: str, texts: Iterable[str], error: type[OptidError] = DataE
 
 def sampling_time(dt: Any) -> float:
     """Return dt as a float; refuse what is not a positive number (`DataError`)."""
-    if isinstance(dt, bool) or not isinstance(dt, int | float | np.integer | np.floating) or not 0 < dt < np.inf:
+    if not is_number(dt) or not 0 < dt < np.inf:
         raise DataError(f"dt = {dt!r}: the sampling time must be a positive number.")
     return float(dt)
 

@@ -3,7 +3,7 @@
 import json
 import re
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -28,16 +28,12 @@ SOURCES = ("optid", "formulations")
 
 
 @contextmanager
-def connect_cluster(scheduler: Any, packages: Sequence[str] = PACKAGES) -> Iterator[Any]:
+def connect_cluster(scheduler: Any) -> Iterator[Any]:
     """Give a `distributed.Client` whose workers run the same versions as this process.
 
-    Args:
-        scheduler: address ("tcp://host:8786", "host:8786"), path of a scheduler file (.json), or an open Client, which
-            stays open; for a cluster with certificates open the Client yourself.
-        packages: distributions to compare.
-
-    Raises:
-        ClusterError: Dask is not installed, no scheduler at the address, no worker, or workers with other versions.
+    The scheduler is an address ("tcp://host:8786", "host:8786"), the path of a scheduler file (.json), or an open
+    Client, which stays open; for a cluster with certificates open the Client yourself. `ClusterError`: Dask is not
+    installed, no scheduler at the address, no worker, or workers with other versions.
     """
     try:
         from distributed import Client
@@ -52,7 +48,7 @@ def connect_cluster(scheduler: Any, packages: Sequence[str] = PACKAGES) -> Itera
     else:
         opened = _opened(Client, scheduler)
     with opened as client:
-        check_workers(client, packages)
+        check_workers(client)
         yield client
 
 
@@ -139,13 +135,7 @@ def _reader(packages: Sequence[str]) -> Callable[[], dict[str, str]]:
     return read
 
 
-def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
-    """Return the differing versions as text, "" if there are none."""
-    return ", ".join(f"{name}: {here[name]} here, {there.get(name, 'not installed')} there"
-                     for name in here if there.get(name) != here[name])
-
-
-def check_workers(client: Any, packages: Sequence[str]) -> None:
+def check_workers(client: Any, packages: Sequence[str] = PACKAGES) -> None:
     """Raise a `ClusterError` if there are no workers, or workers with other versions."""
     reader, refusal = _reader(packages), ""
     for _ in range(LOOKS):
@@ -159,7 +149,9 @@ def check_workers(client: Any, packages: Sequence[str]) -> None:
         if isinstance(there[other], BaseException):
             refusal = f"cannot say which versions it has: {type(there[other]).__name__}: {there[other]}"
         else:
-            refusal = f"has other packages: {difference(here, there[other])}. Install the same versions there."
+            differing = ", ".join(f"{name}: {version} here, {there[other].get(name, 'not installed')} there"
+                                  for name, version in here.items() if there[other].get(name) != version)
+            refusal = f"has other packages: {differing}. Install the same versions there."
             if len(there) > 1:
                 same = sum(versions == there[other] for versions in there.values())
                 refusal = f"({same} of {len(there)} workers) {refusal}"

@@ -15,8 +15,7 @@ def remove_levels(data: Data) -> tuple[Data, Array]:
     The shifts sum to zero, so that the mean of the constants of the experiments of a linear equation stays. An
     experiment without a single sample of an output is refused (`DataError`).
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # an empty mean is refused here
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # an empty mean is refused here
         means = np.array([np.nanmean(e.y, axis=0) for e in data.experiments])
     if not np.isfinite(means).all():
         i, o = np.argwhere(~np.isfinite(means))[0]

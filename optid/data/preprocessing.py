@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from optid.arrays import check_integer
+from optid.arrays import check_integer, is_number
 from optid.data.channels import sampling_time
 from optid.errors import DataError, nearest
 
@@ -112,8 +112,8 @@ def filter(data: Changed, low: float | None = None, high: float | None = None, o
     data.refuse_irregular("a filter")
     edges = [edge for edge in (low, high) if edge is not None]
     nyquist = 0.5 / data.dt
-    if not edges or any(isinstance(edge, bool) or not isinstance(edge, int | float | np.number) for edge in edges) or \
-            not all(a < b for a, b in zip([0.0, *edges], [*edges, nyquist])):
+    if not edges or not all(map(is_number, edges)) or not all(
+            a < b for a, b in zip([0.0, *edges], [*edges, nyquist])):
         raise DataError(f"low={low!r}, high={high!r}: give one or both, 0 < low < high < {nyquist:g} (half the "
                         "sampling rate).")
     _check_whole(data)

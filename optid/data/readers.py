@@ -11,16 +11,18 @@ import numpy as np
 from optid.arrays import as_samples, check_shape
 from optid.data.channels import sampling_time
 from optid.data.reading import columns as known
-from optid.data.reading import long_tables
 from optid.data.reading.clock import TimeColumn, UnreadStamps, clock_columns, clock_values, is_time_name, seconds
 from optid.data.reading.columns import Wanted, choose
-from optid.data.reading.format import Format
+from optid.data.reading.format import Format, is_number
 from optid.data.reading.rival_clocks import settle
 from optid.data.reading.runs import RawRun, cut_between, join_continued, sample_evenly
-from optid.data.reading.sources import RawTable, open_tables
+from optid.data.reading.sources import open_tables
+from optid.data.reading.tables import RawTable
 from optid.data.record import Data, Experiment
 from optid.data.streams import Stream, open_stream
 from optid.errors import DataError
+
+MOST_TAGS = 1000  # of a long table, one row for each tag and instant
 
 __all__ = ["Format", "Stream", "open_stream", "read"]
 
@@ -120,7 +122,7 @@ def _runs(table: RawTable, inputs: Wanted, outputs: Wanted, time: Any, experimen
     try:
         ins, outs = choose(table.names, inputs, "u", label), choose(table.names, outputs, "y", label)
     except DataError as error:
-        raise long_tables.explain_missing_column(error, table, inputs, outputs) from None
+        raise _explain_missing_column(error, table, inputs, outputs) from None
     if table.split is not None:
         tables = table.split([*ins.values(), *outs.values()], time)
         return [run for one in tables for run in _runs(one, ins, outs, None if time is True else time, experiment)]
@@ -235,3 +237,46 @@ def _groups(values: np.ndarray | None, rows: int, label: str) -> list[tuple[Any,
                             "experiment, or give the second run its own value.")
         seen.add(value)
     return [(value, slice(a, b)) for value, a, b in zip(labels, starts, [*starts[1:], rows])]
+
+
+def _explain_missing_column(error: DataError, table: RawTable, inputs: Any, outputs: Any) -> DataError:
+    """Return the error about a missing column, or the one that the table is long where its cells name the channels."""
+    texts = [name for name in table.names if name and name not in table.dates and not is_time_name(name)]
+    if not texts:
+        return error
+    try:
+        loaded = table.load(texts, dict.fromkeys(texts, "text"))
+    except DataError:
+        return error
+    asked = [one for wanted in (inputs, outputs) for one in (
+        wanted.values() if isinstance(wanted, dict) else wanted if isinstance(wanted, list | tuple) else [wanted])
+        if one is not None]
+    for name in texts:
+        cells = np.asarray(loaded[name])
+        if cells.dtype.kind not in "UO" or cells.ndim != 1:
+            continue
+        tags = list(dict.fromkeys(str(cell) for cell in cells[:10_000]))
+        counts = [str(cell) for cell in cells[:10_000]]
+        named = [one for one in asked if counts.count(str(one)) > 1]
+        repeated = len(tags) <= MOST_TAGS and len(cells) >= 4 * len(tags) > 4 and not asked
+        numbers = any(is_number(tag.replace(",", ".")) for tag in tags)  # with decimal commas, too
+        if named or (repeated and not numbers):
+            clock = next((one for one in table.names if one in table.dates or is_time_name(one)), "TIME")
+            numeric = [one for one in table.names if one != name and one in loaded and _is_numeric(loaded[one])]
+            value = next((one for one in numeric if "val" in one.lower()), numeric[0] if numeric else "VALUE")
+            return DataError(
+                f"{table.label} is a long table: column {name!r} holds the tags ({', '.join(tags[:4])}), one row for "
+                f"each tag and instant. Make a column of each tag first, in pandas: "
+                f"frame.set_index([{clock!r}, {name!r}])[{value!r}].unstack(), and read the result.")
+    return error
+
+
+def _is_numeric(values: Any) -> bool:
+    array = np.asarray(values)
+    if array.dtype.kind in "iuf":
+        return True
+    try:
+        array[:100].astype(float)
+    except (ValueError, TypeError):
+        return False
+    return True

@@ -9,42 +9,15 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from optid.arrays import as_list, as_records, import_pandas, one_or_all, read_only
+from optid.data import experiments as parts
 from optid.data import preprocessing
 from optid.data.channels import Channel, Ports, Transform, as_name_list, channel_fields, interval_text, sampling_time
-from optid.data.description import DataDescription, instant
-from optid.data.timeline import Timeline, read_times, seconds_of, starts_of
-from optid.errors import DataError, nearest
+from optid.data.description import DataDescription
+from optid.data.experiments import Experiment
+from optid.data.timeline import Timeline, read_times, starts_of
+from optid.errors import DataError
 from optid.phrases import plural
 from optid.registry import render
-
-
-@dataclass(frozen=True, eq=False)
-class Experiment:
-    """One uninterrupted record.
-
-    Attributes:
-        u: (N, m) inputs, float64, read-only; NaN = missing.
-        y: (N, l) outputs, float64, read-only; NaN = missing.
-        start: time of the first sample.
-        stamps: (N,) times after the first sample where these are irregular, None where they are multiples of dt.
-    """
-
-    u: np.ndarray
-    y: np.ndarray
-    start: float = 0.0
-    stamps: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        if self.u.shape[0] != self.y.shape[0]:
-            raise DataError(f"u has {self.u.shape[0]} samples and y has {self.y.shape[0]}. Cut both to the samples "
-                            "that were recorded together, or fill the lost ones with NaN.")
-        if self.stamps is not None and self.stamps.shape != (self.u.shape[0],):
-            raise DataError(f"{self.stamps.size} irregular times for {self.u.shape[0]} samples: give one for each.")
-
-    @property
-    def n_samples(self) -> int:
-        """Number of samples N."""
-        return self.u.shape[0]
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -283,135 +256,12 @@ class Data(Ports):
 
     # -- parts -----------------------------------------------------------------------------------------------------
 
-    def split(self, at: float | int) -> tuple["Data", "Data"]:
-        """Cut every experiment in two, for estimation and validation.
-
-        Args:
-            at: a float in (0, 1) is the share of the samples of each experiment that goes to the first part; an int
-                is a number of samples.
-
-        Raises:
-            DataError: a part would be empty.
-        """
-        if isinstance(at, bool | np.bool_) or not isinstance(at, int | float | np.integer | np.floating):
-            raise DataError(f"split at {at!r}: must be a share such as 0.7 or a number of samples.")
-        whole = isinstance(at, int | np.integer)
-        if not whole and not 0 < at < 1:
-            raise DataError(f"split at {at}: a share lies between 0 and 1; write int({at}) for a number of samples.")
-        first, second = [], []
-        for k, e in enumerate(self.experiments):
-            cut = int(at) if whole else round(float(at) * e.n_samples)
-            if not 0 < cut < e.n_samples:
-                raise DataError(f"split at {at} leaves an empty part of experiment {k + 1} of {e.n_samples} samples.")
-            first.append(self._cut(e, 0, cut))
-            second.append(self._cut(e, cut, e.n_samples))
-        return self._with(experiments=tuple(first)), self._with(experiments=tuple(second))
-
-    def window(self, first: int, last: int) -> "Data":
-        """Return samples first to last - 1 of every experiment.
-
-        Raises:
-            DataError: the window does not lie inside an experiment.
-        """
-        for k, e in enumerate(self.experiments):
-            if not 0 <= first < last <= e.n_samples:
-                raise DataError(f"window {first}:{last} is not inside experiment {k + 1} of {e.n_samples} samples.")
-        return self._with(experiments=tuple(self._cut(e, first, last) for e in self.experiments))
+    split, window, select, join = parts.split, parts.window, parts.select, staticmethod(parts.join)
+    __getitem__ = parts.take
+    __iter__ = None  # neither samples nor experiments are meant more than the other
 
     def __len__(self) -> int:
         return self.n_samples
-
-    __iter__ = None  # neither samples nor experiments are meant more than the other
-
-    def __getitem__(self, part: slice) -> "Data":
-        """Return data[first:last] by samples (integers, as of a list) or by time (floats, dates), of every experiment.
-
-        Raises:
-            DataError: not a slice, a step, samples mixed with times, or a part without samples.
-        """
-        if not isinstance(part, slice) or part.step is not None:
-            raise DataError("data[first:last] takes samples (data[100:200]) or times (data[1.0:2.0]), and no step; "
-                            "use decimate for every k-th sample, .u and .y for arrays.")
-        asked, ends = part, [end for end in (part.start, part.stop) if end is not None]
-        if self.dated:
-            ends = [seconds_of(end) for end in ends]
-            part = slice(*(None if end is None else seconds_of(end) for end in (part.start, part.stop)))
-        whole = all(isinstance(end, int | np.integer) and not isinstance(end, bool) for end in ends)
-        if not whole and not all(isinstance(end, float | np.floating) and end == end for end in ends):
-            raise DataError(f"data[{asked.start!r}:{asked.stop!r}]: two integers are samples, two floats are times.")
-
-        def sample(end: Any, e: Experiment) -> int | None:
-            """The first sample not before a time, with 1e-6 of a step for the rounding of the times."""
-            if end is None or whole:
-                return end
-            if e.stamps is not None:
-                return int(np.searchsorted(e.stamps, end - e.start - 1e-6 * self.dt))
-            return int(np.ceil(min(max((end - e.start) / self.dt - 1e-6, 0.0), e.n_samples)))
-
-        spans = [slice(sample(part.start, e), sample(part.stop, e)).indices(e.n_samples) for e in self.experiments]
-        kept = [self._cut(e, first, last) for e, (first, last, _) in zip(self.experiments, spans) if first < last]
-        if not kept:
-            raise DataError(f"data[{asked.start}:{asked.stop}] holds no samples; there are "
-                            f"{', '.join(str(e.n_samples) for e in self.experiments)} "
-                            f"from time {', '.join(instant(line.instants([0])[0]) for line in self.timelines)}.")
-        return self._with(experiments=tuple(kept))
-
-    def select(self, inputs: str | Sequence[str] | None = None, outputs: str | Sequence[str] | None = None,
-               experiments: int | Sequence[int] | None = None) -> "Data":
-        """Keep some channels and some experiments, in the order given.
-
-        Args:
-            inputs: names of inputs; all when not given.
-            outputs: names of outputs; all when not given.
-            experiments: indices of experiments, from 0; all when not given.
-
-        Raises:
-            DataError: unknown name (the nearest is named) or index.
-        """
-        i = _positions(inputs, self.inputs, "input")
-        o = _positions(outputs, self.outputs, "output")
-        picked = range(self.n_experiments) if experiments is None else np.atleast_1d(experiments).tolist()
-        for k in picked:
-            if not 0 <= k < self.n_experiments:
-                raise DataError(f"experiment {k} does not exist; there are {self.n_experiments}, counted from 0.")
-        if not (i and o and len(picked)):
-            raise DataError("select leaves no input, no output or no experiment; name at least one of each.")
-        kept = [self.experiments[k] for k in picked]
-        t = self.transform
-        return self._with(
-            experiments=tuple(Experiment(read_only(e.u[:, i]), read_only(e.y[:, o]), e.start, e.stamps) for e in kept),
-            inputs=_take(self.inputs, i), outputs=_take(self.outputs, o), input_units=_take(self.input_units, i),
-            output_units=_take(self.output_units, o),
-            transform=Transform(_take(t.u_scale, i), _take(t.u_offset, i), _take(t.y_scale, o), _take(t.y_offset, o)),
-        )
-
-    @staticmethod
-    def join(*parts: "Data") -> "Data":
-        """Return the experiments of several data sets as one data set.
-
-        Raises:
-            DataError: names, units, sampling times or transforms differ, or the times are dates in some of them only.
-        """
-        if not parts:
-            raise DataError("join needs at least one data set.")
-        head = parts[0]
-        for k, part in enumerate(parts[1:], start=2):
-            for what in ("inputs", "outputs", "input_units", "output_units"):
-                if getattr(part, what) != getattr(head, what):
-                    raise DataError(f"data set {k} has {what} {getattr(part, what)}, the first has "
-                                    f"{getattr(head, what)}; give them the same names and units, or use select.")
-            if abs(part.dt - head.dt) > 1e-9 * head.dt:
-                raise DataError(f"data set {k} is sampled every {part.interval}, the first every {head.interval}; "
-                                "decimate the faster one.")
-            if part.transform != head.transform:
-                raise DataError(f"data set {k} was detrended or scaled differently; join first, or call raw() on both.")
-            if part.dated != head.dated:
-                raise DataError(f"the times of data set {k} are {'dates' if part.dated else 'numbers'}, those of the "
-                                f"first are {'dates' if head.dated else 'numbers'}; give both dates (start=).")
-        units = {part.time_unit for part in parts}
-        return head._with(experiments=tuple(e for part in parts for e in part.experiments),
-                          time_unit=head.time_unit if len(units) == 1 else "",
-                          findings=tuple(dict.fromkeys(finding for part in parts for finding in part.findings)))
 
     # -- changes of the samples --------------------------------------------------------------------------------------
 
@@ -432,11 +282,11 @@ class Data(Ports):
 
     def with_findings(self, findings: Iterable[str]) -> "Data":
         """Return the same record with other findings."""
-        return self._with(findings=tuple(findings))
+        return self.with_fields(findings=tuple(findings))
 
     def without_transform(self) -> "Data":
         """Return the same samples without the way back to raw units."""
-        return self._with(transform=Transform.identity(self.m, self.l))
+        return self.with_fields(transform=Transform.identity(self.m, self.l))
 
     def map_signals(self, of_u: Callable, of_y: Callable, **changes: Any) -> "Data":
         """Return data with every u (N, m) and y (N, l) replaced by of_u(u) and of_y(y), and other fields by `changes`.
@@ -444,15 +294,10 @@ class Data(Ports):
         The functions must not change their arguments.
         """
         experiments = tuple(replace(e, u=read_only(of_u(e.u)), y=read_only(of_y(e.y))) for e in self.experiments)
-        return self._with(experiments=experiments, **changes)
+        return self.with_fields(experiments=experiments, **changes)
 
-    def _cut(self, e: Experiment, first: int, last: int) -> Experiment:
-        if e.stamps is None:
-            return Experiment(e.u[first:last], e.y[first:last], e.start + first * self.dt)
-        t = e.stamps[first:last]
-        return Experiment(e.u[first:last], e.y[first:last], e.start + float(t[0]), read_only(t - t[0]))
-
-    def _with(self, **changes: Any) -> "Data":
+    def with_fields(self, **changes: Any) -> "Data":
+        """Return the record with other values of some attributes, which are not checked."""
         return _filled(object.__new__(Data), **{f.name: getattr(self, f.name) for f in fields(self)} | changes)
 
 
@@ -463,18 +308,6 @@ def _filled(data: Data, **values: Any) -> Data:
     for name, value in values.items():
         object.__setattr__(data, name, value)
     return data
-
-
-def _positions(wanted: str | Sequence[str] | None, known: tuple[str, ...], what: str) -> list[int]:
-    wanted = list(known) if wanted is None else as_name_list(wanted)
-    for name in wanted or ():
-        if name not in known:
-            raise DataError(f"no {what} {name!r}. {nearest(name, known)}")
-    return [known.index(name) for name in wanted or ()]
-
-
-def _take(values: tuple, positions: Sequence[int]) -> tuple:
-    return tuple(values[p] for p in positions)
 
 
 def not_a_record(data: Any, what: str) -> str:

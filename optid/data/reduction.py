@@ -52,18 +52,11 @@ def map_parts(function: Callable[[One], Result], parts: Iterable[One], threads: 
 
 def reduce_parts(parts: Sequence[Part], leaf: Callable[[Part], Result], merge: Callable[[Sequence[Result]], Result],
                  scheduler: Any = None, threads: int = 1) -> Result:
-    """Return the merged results of all parts.
+    """Return the results of `leaf` on all parts (at least one), merged.
 
-    Args:
-        parts: at least one, in order.
-        leaf: function of a part, which is sent to the workers.
-        merge: function of at most `FAN_IN` neighbouring results, in order; it must not change them.
-        scheduler: address of a Dask scheduler, a `distributed.Client`, or None for this machine, where the partitions
-            of Dask collections are computed by Dask's current scheduler.
-        threads: threads that read parts on this machine.
-
-    Raises:
-        ClusterError: the cluster cannot be used.
+    `leaf` is sent to the workers; `merge` takes at most `FAN_IN` neighbouring results, in order, and must not change
+    them. The scheduler is the address of one of Dask, a `distributed.Client`, or None for this machine, where the
+    partitions of Dask collections are computed by Dask's current one. `ClusterError`: the cluster cannot be used.
     """
     if scheduler is None and all(part.content is None for part in parts):
         return tree(map_parts(leaf, parts, threads), len(parts), merge)

@@ -16,7 +16,8 @@ from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.parts import Part
 from optid.data.reading.rival_clocks import settle
-from optid.data.reading.sources import Source, open_source
+from optid.data.reading.sources import open_source
+from optid.data.reading.tables import Source
 from optid.data.reading.uniform import COARSE, agreed_step, share_of_repeats, uniform_step
 from optid.data.reduction import available_cores, fetch_part, reduce_parts
 from optid.errors import DataError

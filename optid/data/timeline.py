@@ -16,21 +16,13 @@ EVEN = 1e-6  # of a sampling time by which a time may miss a multiple of it and 
 
 @dataclass(frozen=True)
 class Timeline:
-    """The times of the samples of an experiment.
+    """The times of the samples of an experiment."""
 
-    Attributes:
-        start: time of sample 0; seconds since 1970 (UTC) where the times are dates.
-        dt: sampling time.
-        unit: its unit; "" where it is unknown.
-        dated: whether the times are dates.
-        stamps: (N,) times after sample 0 where these are no multiples of dt.
-    """
-
-    start: float = 0.0
-    dt: float = 1.0
-    unit: str = ""
-    dated: bool = False
-    stamps: np.ndarray | None = None
+    start: float = 0.0  # time of sample 0; seconds since 1970 (UTC) where the times are dates
+    dt: float = 1.0  # sampling time
+    unit: str = ""  # its unit; "" where it is unknown
+    dated: bool = False  # whether the times are dates
+    stamps: np.ndarray | None = None  # (N,) times after sample 0 where these are no multiples of dt
 
     def instants(self, samples: Any) -> np.ndarray:
         """Return the times of samples (n,), as datetime64 where they are dates."""

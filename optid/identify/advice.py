@@ -15,7 +15,7 @@ from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks
 from optid.identify.informativity import Informativity, informativity
-from optid.identify.lag_sums import LagSums, linear
+from optid.identify.lag_sums import LagSums
 from optid.identify.validation.checks import shares_outside
 from optid.identify.validation.predictions import SIMULATION, fit_percent, prediction_fit, simulated_or_nan
 from optid.models.functions import has_feedback
@@ -140,7 +140,7 @@ def _swapped(data: Data) -> Iterator[Advice]:
 
 def _drive(data: Data) -> float:
     """Return the reduction of the log one-step error of the output by past inputs."""
-    sums = LagSums(Blocks.of(data), linear(data), na=6, lags=8)
+    sums = LagSums(Blocks.of(data), na=6, lags=8)
     with_input = sums.columns(sums.layout.na, sums.layout.nb[0] - 1, (1,))
     alone = np.concatenate([with_input[: sums.layout.na], with_input[-1:]])
     return float(np.log(max(sums.remainder(alone), 1e-12) / max(sums.remainder(with_input), 1e-12)))
@@ -291,8 +291,7 @@ def advise_on_poles(fit: Any) -> Iterator[Advice]:
 
 def _try(fit: Any, **changes: Any) -> Any:
     """Fit again with changes; None where that fails."""
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"), np.errstate(all="ignore"):
         try:
             return fit.refit(**changes)
         except (OptidError, np.linalg.LinAlgError, ValueError):

@@ -100,13 +100,8 @@ class Blocks:
 
         The measure is the variance of the output in the whole record times the number of compared samples. The energy
         is infinite where the simulation diverges; that of an unstable model is also judged from a state fitted to a
-        third of the block.
-
-        Args:
-            model: the model.
-            block: number of the block.
-            horizon: prediction horizon in samples; None for simulation, with the initial state fitted to the block and
-                its surroundings, see `WIDER`.
+        third of the block. The horizon counts samples; None simulates, with the initial state fitted to the block and
+        its surroundings, see `WIDER`.
         """
         variance, span = self.outputs
         if horizon is None and not model.is_stable and self._diverges(model, block):

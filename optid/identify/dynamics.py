@@ -73,29 +73,24 @@ def middle(low: float, high: float) -> tuple[float, float]:
     return round(low + quarter, digits), round(high - quarter, digits)
 
 
-def integrating_pole(model: Any, known: Any = None) -> tuple[float, str]:
-    """Return a real pole that is 1, or not told from 1 by the record, and the sentence about it; NaN, "" for none.
+def integration(model: Any, known: Any = None) -> str:
+    """Return the sentence about a real pole that is 1, or not told from 1 by the record; "" where there is none.
 
     With nonlinear feedback, or functions of latent signals, the poles of the linear part do not decide.
     """
     if has_feedback(model) or getattr(model, "latent", ()):
-        return np.nan, ""
-    for pole in real_poles(poles_of(model)):
+        return ""
+    for pole in (float(pole.real) for pole in poles_of(model) if pole.imag == 0):
         if abs(pole - 1) <= AT_ONE:
-            return pole, "A pole at 1: the model integrates, its output comes to rest at no level"
+            return "A pole at 1: the model integrates, its output comes to rest at no level"
         if known is not None and pole > 0:
             found = known.of(lambda model, pole=pole: nearest_real(poles_of(model), pole))
             if model.structure == "process" and found.lower <= 0:
                 continue  # a time constant that is not told from zero
             if found.lower <= 1 <= found.upper:
-                return pole, (f"The record does not tell the pole {pole:.5g} (from {float(found.lower):.5g} to "
-                              f"{float(found.upper):.5g}) from 1: the model may integrate, no level of rest is known")
-    return np.nan, ""
-
-
-def real_poles(poles: Array) -> list[float]:
-    """Return the real ones."""
-    return [float(pole.real) for pole in poles if pole.imag == 0]
+                return (f"The record does not tell the pole {pole:.5g} (from {float(found.lower):.5g} to "
+                        f"{float(found.upper):.5g}) from 1: the model may integrate, no level of rest is known")
+    return ""
 
 
 def nearest_real(poles: Array, pole: float) -> float:
@@ -217,7 +212,7 @@ class _Reading:
         for pole, kind in zip(poles, kinds):
             counts[kind] += 1
             number = f" {counts[kind]}" if kinds.count(kind) > 1 else ""
-            found += getattr(self, f"_{kind}")(pole, number)
+            found += [] if kind == "integrates" else getattr(self, f"_{kind}")(pole, number)  # its slopes say it
         return found
 
     def _real(self, pole: complex) -> Array:
@@ -229,31 +224,25 @@ class _Reading:
 
     def _decay(self, pole: complex, number: str) -> list[Parameter]:
         p, error, low, high = self._real(pole)
-        dt = self.model.dt
-        ends = [np.nan if np.isnan(end) else 0.0 if end <= 0 else np.inf if end >= 1 else -dt / np.log(end)
-                for end in (low, high)]
+        grows, name, dt = p > 1, "time constant", self.model.dt
+        if grows and low <= 1:
+            return [_parameter(f"pole{number}", (p, error, low, high))]
+        if grows:
+            name, low, high = "time constant of growth", high, low
+            self.notes.append("Time constant of growth: a pole above 1, the model is unstable.")
+        ends = [np.nan if np.isnan(end) else 0.0 if end <= 0 else np.inf if end >= 1 and not grows
+                else abs(dt / np.log(end)) for end in (low, high)]
         if np.isinf(ends[1]):
             self.notes.append("A time constant without upper end: the record does not tell its pole from 1, the plant "
                               "may integrate.")
-        row = -dt / np.log(p), error * dt / (p * np.log(p) ** 2), *ends
-        return [_parameter(f"time constant{number}", row, self.time)]
+        row = abs(dt / np.log(p)), error * dt / (p * np.log(p) ** 2), *ends
+        return [_parameter(f"{name}{number}", row, self.time)]
 
-    def _growth(self, pole: complex, number: str) -> list[Parameter]:
-        p, error, low, high = self._real(pole)
-        dt = self.model.dt
-        if low <= 1:
-            return [_parameter(f"pole{number}", (p, error, low, high))]
-        ends = [dt / np.log(end) for end in (high, low)]
-        self.notes.append("Time constant of growth: a pole above 1, the model is unstable.")
-        row = dt / np.log(p), error * dt / (p * np.log(p) ** 2), *ends
-        return [_parameter(f"time constant of growth{number}", row, self.time)]
+    _growth = _decay
 
     def _negative(self, pole: complex, number: str) -> list[Parameter]:
         self.notes.append("A negative real pole alternates from sample to sample: it has no time constant.")
         return [_parameter(f"negative pole{number}", self._real(pole))]
-
-    def _integrates(self, pole: complex, number: str) -> list[Parameter]:
-        return []  # its slopes say it
 
     def _pair(self, pole: complex, number: str) -> list[Parameter]:
         dt = self.model.dt
@@ -323,7 +312,7 @@ class _Reading:
     def gains(self) -> list[Parameter]:
         """Return the static gain from every input to every output, or the slopes of a model that integrates."""
         found = []
-        _, integrates = integrating_pole(self.model, self.known)
+        integrates = integration(self.model, self.known)
         if integrates:
             self.notes.append(f"{integrates}. The slope is that of the response to a step, for a unit of the input.")
         for c, name in enumerate(self.model.inputs):

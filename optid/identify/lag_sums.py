@@ -4,15 +4,13 @@ The sums of products of a record without a block are those of the whole less tho
 its own samples and as many after it as there are lags. All structures are columns of the largest one.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.bases import Linear
-from optid.bases.basis import Basis
-from optid.data.record import Data
 from optid.data.repeats import RepeatedPart
 from optid.errors import RankError
 from optid.identify.blocks import Blocks, join_parts
@@ -24,25 +22,24 @@ ROWS_PER_COLUMN = 4
 RIDGE = 1e-12
 
 
-@dataclass(frozen=True)
-class Autoregression:
+class Autoregression(NamedTuple):
     """Orders of an autoregression, and the mean squared one-step error of the blocks left out over the variance."""
 
+    error: float
     na: int
     nb: int
     nk: tuple[int, ...]
-    error: float
 
 
 class LagSums:
     """Sums of products of lagged samples: of the `whole` record, and of the rows of every block (`blocks`)."""
 
-    def __init__(self, blocks: Blocks, bases: tuple[Basis, ...], na: int = 8, lags: int = 16) -> None:
+    def __init__(self, blocks: Blocks, na: int = 8, lags: int = 16) -> None:
         data = blocks.data
-        width, rows = sum(basis.size for basis in bases), data.n_samples
-        while na * data.l + lags * width + 1 > rows / ROWS_PER_COLUMN and na + lags > 3:
+        while na * data.l + lags * data.m + 1 > data.n_samples / ROWS_PER_COLUMN and na + lags > 3:
             na, lags = max(na - 1, 1), max(lags - 2, 2)
-        self.data, self.layout = data, Layout(na, (lags,) * data.m, (0,) * data.m, bases, data.outputs, data.inputs)
+        self.data = data
+        self.layout = Layout(na, (lags,) * data.m, (0,) * data.m, (Linear(),) * data.m, data.outputs, data.inputs)
         lengths, reach = [e.n_samples for e in data.experiments], self.layout.first_row
         self.whole = self._of([RepeatedPart(i, 0, n) for i, n in enumerate(lengths)])
         self.blocks = [self._of([RepeatedPart(i, max(first - reach, 0), min(last + reach, lengths[i]))
@@ -60,11 +57,11 @@ class LagSums:
 
     def columns(self, na: int, nb: int, nk: tuple[int, ...]) -> Places:
         """Return the columns of a smaller structure."""
-        found, lags = list(range(na * self.data.l)), self.layout.nb[0]
-        for c, (basis, delay) in enumerate(zip(self.layout.bases, nk)):
+        found = list(range(na * self.data.l))
+        for c, delay in enumerate(nk):
             block = self.layout.block(c)
-            first = block.start + min(delay, lags) * basis.size
-            found += range(first, min(first + nb * basis.size, block.stop))
+            first = min(block.start + delay, block.stop)
+            found += range(first, min(first + nb, block.stop))
         return np.array([*found, self.layout.offset], dtype=np.intp)
 
     def error(self, na: int, nb: int, nk: tuple[int, ...]) -> float:
@@ -89,14 +86,8 @@ class LagSums:
 def scan(sums: LagSums, delays: list[tuple[int, ...]]) -> list[Autoregression]:
     """Compare autoregressions of all orders with some delays; the best first."""
     layout = sums.layout
-    found = [Autoregression(na, nb, nk, sums.error(na, nb, nk)) for nk in delays for na in range(1, layout.na + 1)
-             for nb in range(1, min(layout.nb[0] - max(nk), 8) + 1)]
-    return sorted(found, key=lambda one: one.error)
-
-
-def linear(data: Data) -> tuple[Basis, ...]:
-    """Return the basis of a linear model for every input."""
-    return (Linear(),) * data.m
+    return sorted(Autoregression(sums.error(na, nb, nk), na, nb, nk) for nk in delays for na in range(1, layout.na + 1)
+                  for nb in range(1, min(layout.nb[0] - max(nk), 8) + 1))
 
 
 def _solved(gram: Array, columns: Places, y: Places) -> Array:

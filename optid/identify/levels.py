@@ -1,7 +1,7 @@
 """Whether the experiments of a record have levels of their own: one constant of the equation against one for each.
 
-Both are compared by the Bayesian information criterion (Schwarz, Annals of Statistics 6, 1978) of an ARX model with
-unrestricted functions of the inputs, from two passes over the record. The past of the outputs takes up the colour of
+Both are compared by the Bayesian information criterion (Schwarz, Annals of Statistics 6, 1978) of an ARX model, from
+two passes over the record. The past of the outputs takes up the colour of
 the noise; what is left of it could otherwise pass for levels.
 """
 
@@ -10,27 +10,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.equation_error import EquationError, EquationStructure, compress
 
+LAGS = 4  # past outputs, several, so that they take up the colour of the noise, and lags of every input
 FLOOR = 1e-12  # residual standard deviation, as a share of that of the output, that counts as zero
 
 
 @dataclass(frozen=True)
 class LevelEvidence:
-    """The evidence for levels of the experiments.
+    """The evidence for levels of the experiments."""
 
-    Attributes:
-        one: Bayesian information criterion with one constant for all experiments; small is good.
-        each: the same with one for each.
-        experiments: number of experiments.
-    """
-
-    one: float
-    each: float
-    experiments: int
+    one: float  # Bayesian information criterion with one constant for all experiments; small is good
+    each: float  # the same with one for each
+    experiments: int  # number of experiments
 
     @property
     def offset(self) -> bool | str:
@@ -43,25 +37,18 @@ class LevelEvidence:
                 f"{self.one:.1f} with one for all")
 
 
-def level_evidence(data: Data, *, na: int = 4, nb: int | Sequence[int] = 4, nk: int | Sequence[int] = 0,
-                   basis: Basis | str | Sequence[Basis | str] = "linear") -> LevelEvidence:
-    """Compare one constant for all experiments of a record with one for each.
-
-    Args:
-        data: a record in memory with several experiments.
-        na: number of past outputs; several, so that they take up the colour of the noise.
-        nb: number of lags of an input, one per input or one for all.
-        nk: delay in samples, likewise.
-        basis: functions of an input, likewise.
+def level_evidence(data: Data, nk: int | Sequence[int] = 0) -> LevelEvidence:
+    """Compare one constant for all experiments of a record in memory with one for each; nk are the delays.
 
     Raises:
-        StructureError: a single experiment, a stream, impossible orders.
+        StructureError: a single experiment.
         RankError: the record does not determine the model.
         DataError: an experiment without a sample of an output.
     """
-    if isinstance(data, Data) and data.n_experiments == 1:
+    if data.n_experiments == 1:
         raise StructureError("the record has one experiment, so that it has one level")
-    one, each = (compress(data, EquationStructure(na, nb, nk, basis, offset=offset)) for offset in (True, "each"))
+    one, each = (compress(data, EquationStructure(LAGS, LAGS, nk, "linear", offset=offset))
+                 for offset in (True, "each"))
     return LevelEvidence(_criterion(one), _criterion(each), data.n_experiments)
 
 

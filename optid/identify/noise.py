@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +27,8 @@ from optid.lazy import public_names
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import Likelihood, OneStepPredictor, covariance_of, refine_gain
 from optid.models.kalman import NoiseCovariances, kalman_gain
+from optid.models.model import ROUNDING as ON_CIRCLE
+from optid.models.model import impulse_response
 from optid.models.roots import spectral_radius
 from optid.models.state_space import StateSpace
 from optid.statistics.coloured import long_autoregression, response_of
@@ -42,6 +45,36 @@ BLOCK, BLOCKS, PER_ENTRY = 2048, 2, 50
 # gain of the log-likelihood that is negligible in a part of a record, and difference between two optima of it
 NEARLY, ELSEWHERE = 0.1, 1.0
 LIKELIEST = attrgetter("log_determinant")  # key of predictors
+
+
+class NoiseFilter(NamedTuple):
+    """The noise at the outputs, ``(I + C (qI - F)^-1 K) e`` with white e."""
+
+    F: Array  # (n, n)
+    K: Array  # (n, l)
+    C: Array  # (l, n)
+    covariance: Array  # (l, l) of e
+
+    def response(self, count: int) -> Array:
+        """Return what a unit of e adds to the outputs of so many samples, (count, l, l)."""
+        return impulse_response(self.F, self.K, self.C, np.eye(len(self.C)), count)
+
+    def variances(self, ahead: int) -> Array:
+        """Return the variances (ahead, l) of what e of the last 1, 2, ... samples adds to the outputs."""
+        response = self.response(ahead)
+        with np.errstate(all="ignore"):  # an unstable one leaves the range of numbers
+            return np.cumsum(np.einsum("kip,pq,kiq->ki", response, self.covariance, response), axis=0)
+
+    def stationary(self, nearest: float = ON_CIRCLE) -> Array | None:
+        """Return the variances (l,) of the stationary noise; None where a pole comes so near to the unit circle."""
+        from scipy.linalg import solve_discrete_lyapunov
+
+        if not self.K.any():
+            return np.diag(self.covariance)
+        if spectral_radius(self.F) >= 1 - nearest:
+            return None
+        states = solve_discrete_lyapunov(self.F, self.K @ self.covariance @ self.K.T)
+        return np.diag(self.C @ states @ self.C.T + self.covariance)
 
 
 def with_noise(model: HammersteinSS, data: Data) -> HammersteinSS:
@@ -114,20 +147,13 @@ def colour(model: HammersteinSS, data: Data, lags: int = 25) -> dict[str, Correl
     return {name: autocorrelation([r[:, o] for r in rest], name, lags) for o, name in enumerate(model.outputs)}
 
 
-def output_noise(model: HammersteinSS) -> Array:
-    """Return the covariance (l, l) of the noise at the outputs, process and measurement noise together.
+def output_deviations(model: HammersteinSS) -> Array:
+    """Return the standard deviations (l,) of the noise at the outputs, process and measurement noise together.
 
-    It is infinite where a pole on or outside the unit circle is driven by the noise; refused as `noise_spectrum`.
+    They are infinite where a pole on or outside the unit circle is driven by the noise; refused as `noise_spectrum`.
     """
-    from scipy.linalg import solve_discrete_lyapunov
-
-    covariance = _innovations(model)
-    if not model.K.any():
-        return covariance
-    if not model.is_stable:
-        return np.full((model.l, model.l), np.inf)
-    states = solve_discrete_lyapunov(model.A, model.K @ covariance @ model.K.T)
-    return np.asarray(model.C @ states @ model.C.T + covariance)
+    variances = NoiseFilter(model.A, model.K, model.C, _innovations(model)).stationary()
+    return np.full(model.l, np.inf) if variances is None else np.sqrt(variances)
 
 
 def _innovations(model: HammersteinSS) -> Array:

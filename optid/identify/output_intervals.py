@@ -18,6 +18,7 @@ from scipy.special import stdtrit
 from optid.arrays import Array, as_list, check_integer, check_probability, one_or_all
 from optid.data.record import Data
 from optid.errors import DataWarning, RankError, StructureError
+from optid.identify.noise import NoiseFilter
 from optid.identify.prediction_error.error_noise import ErrorNoise
 from optid.identify.record_checks import list_outside
 from optid.identify.tangent import Tangent
@@ -25,8 +26,7 @@ from optid.identify.uncertainty import Interval, Uncertainty
 from optid.identify.validation.predictions import one_step_or_nan, simulated_or_nan
 from optid.models.experiments import records_of
 from optid.models.functions import has_feedback
-from optid.models.model import ROUNDING, impulse_response
-from optid.models.roots import spectral_radius
+from optid.models.model import ROUNDING
 from optid.structures.whitening import symmetric_root
 
 LONGEST = 4096  # samples of a response of the noise whose spectrum is computed, at most
@@ -59,36 +59,6 @@ class OutputInterval(Interval):
         known = np.isfinite(measured) & np.isfinite(self.lower)
         inside = known & (self.lower <= measured) & (measured <= self.upper)
         return np.atleast_1d(inside.sum(axis=0)), np.atleast_1d(known.sum(axis=0))
-
-
-class NoiseFilter(NamedTuple):
-    """The noise at the outputs, ``(I + C (qI - F)^-1 K) e`` with white e."""
-
-    F: Array  # (n, n)
-    K: Array  # (n, l)
-    C: Array  # (l, n)
-    covariance: Array  # (l, l) of e
-
-    def response(self, count: int) -> Array:
-        """Return what a unit of e adds to the outputs of so many samples, (count, l, l)."""
-        return impulse_response(self.F, self.K, self.C, np.eye(len(self.C)), count)
-
-    def variances(self, ahead: int) -> Array:
-        """Return the variances (ahead, l) of what e of the last 1, 2, ... samples adds to the outputs."""
-        response = self.response(ahead)
-        with np.errstate(all="ignore"):  # an unstable one leaves the range of numbers
-            return np.cumsum(np.einsum("kip,pq,kiq->ki", response, self.covariance, response), axis=0)
-
-    def stationary(self, nearest: float = ROUNDING) -> Array | None:
-        """Return the variances (l,) of the stationary noise; None where a pole comes so near to the unit circle."""
-        from scipy.linalg import solve_discrete_lyapunov
-
-        if not self.K.any():
-            return np.diag(self.covariance)
-        if spectral_radius(self.F) >= 1 - nearest:
-            return None
-        states = solve_discrete_lyapunov(self.F, self.K @ self.covariance @ self.K.T)
-        return np.diag(self.C @ states @ self.C.T + self.covariance)
 
 
 class Noise(NamedTuple):
@@ -242,8 +212,7 @@ def _inflation(known: Tangent) -> float:
 
 def _errors(model: Any, raw: Data, horizon: int | None) -> list[Array] | None:
     """Return the errors (N, l) of a simulation or prediction of every experiment; None where an output has none."""
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning), np.errstate(all="ignore"):
         runs = simulated_or_nan(model, raw) if horizon is None else one_step_or_nan(model, raw, horizon)
         errors = [e.y - run for e, run in zip(raw.experiments, runs)]
     return errors if np.isfinite(np.vstack(errors)).any(axis=0).all() else None
@@ -264,8 +233,7 @@ def _intervals(known: Uncertainty, run: Run, noise: Noise, counts: Sequence[int]
     here = np.isfinite(np.vstack(values))
 
     def outputs(model: Any) -> Array:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)  # given for the model of the fit
+        with warnings.catch_warnings(action="ignore", category=DataWarning):  # given for the model of the fit
             return np.vstack([np.reshape(one, (count, -1)) for one, count in zip(run(model), counts)])[here]
 
     def of_experiments(part: Array) -> list[Array]:

@@ -51,15 +51,10 @@ def without_outliers(data: Data, figures: Mapping[str, Any]) -> Data:
 def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | None = None) -> list[str]:
     """Return the weaknesses of a record, one sentence each, and issue every sentence as a `DataWarning`.
 
-    Args:
-        data: the record.
-        bases: one fitted basis per input.
-        arguments: of the formulation; its lags (nb, or block_rows of a subspace method) are compared with the spectral
-            lines of the inputs. With a tolerance among them a singular regressor is only a warning.
-
-    Raises:
-        DataError: a constant or missing channel, too few levels to determine the basis, or too few spectral lines to
-            determine its coefficients at every lag.
+    There is one fitted basis per input. The lags among the arguments of the formulation (nb, or block_rows of a
+    subspace method) are compared with the spectral lines of the inputs; with a tolerance among them a singular
+    regressor is only a warning. `DataError`: a constant or missing channel, too few levels to determine the basis, or
+    too few spectral lines to determine its coefficients at every lag.
     """
     arguments = arguments or {}
     forced = arguments.get("tolerance") is not None

@@ -73,8 +73,7 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
     check_integer(runs, "runs", 40)
     check_probability(level, "level")
     models, failed = [], 0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # given at the fit
+    with warnings.catch_warnings(action="ignore", category=DataWarning):  # given at the fit
         for record in track(_records(fit, runs, seed), "bootstrap", runs):
             again = refit(record, fit.formulation, solver=solver, prove=False, raises=False, **fit.arguments)
             if again.model is None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, DataWarning, OptidError, StructureError
-from optid.identify.dynamics import Levels, integrating_pole, jumps, slope_samples
+from optid.identify.dynamics import Levels, integration, jumps, slope_samples
 from optid.models.functions import has_feedback
 from optid.models.roots import AT_ONE, poles_of
 
@@ -29,28 +29,18 @@ Kind = Literal["static", "rate", "step"]
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """A curve of an output: at rest against an input, how fast it moves against an input, or after a step of an input.
+    """A curve of an output: at rest, or how fast it moves, against an input, or after a step of an input."""
 
-    Attributes:
-        kind: "static" (output at rest), "rate" (change of the output per unit of time, above that at the lower level),
-            or "step" (change of the output as the input goes from the lower level to the upper one).
-        input: index of the input.
-        output: index of the output.
-        levels: (low, high) of the input.
-        at: (k,) inputs, or times after the step.
-        value: (k,).
-        error: (k,) standard errors; NaN where there are none, like the ends of the intervals.
-        lower, upper: (k,) ends of the pointwise intervals.
-    """
-
+    # "static" (output at rest), "rate" (change of the output per unit of time, above that at the lower level), or
+    # "step" (change of the output as the input goes from the lower level to the upper one)
     kind: Kind
-    input: int
-    output: int
-    levels: tuple[float, float]
-    at: Array
-    value: Array
-    error: Array
-    lower: Array
+    input: int  # index of the input
+    output: int  # index of the output
+    levels: tuple[float, float]  # (low, high) of the input
+    at: Array  # (k,) inputs, or times after the step
+    value: Array  # (k,)
+    error: Array  # (k,) standard errors; NaN where there are none, like the ends of the intervals
+    lower: Array  # (k,) ends of the pointwise intervals
     upper: Array
 
     @property
@@ -76,7 +66,7 @@ def responses(model: Any, levels: Levels, known: Any = None, longest: int = LONG
         The curves, and why some are missing, one sentence each.
     """
     found, reasons = [], []
-    integrates = integrating_pole(model, known)[1]
+    integrates = integration(model, known)
     if integrates:
         reasons.append(f"No static characteristic: {integrates[0].lower()}{integrates[1:]}.")
     count = count or step_samples(model, bool(integrates), longest)
@@ -163,7 +153,6 @@ def _step(model: Any, c: int, low: float, high: float, count: int) -> Array:
         u[c] = low
         state, before = model.equilibrium(u)
         u[c] = high
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
+        with warnings.catch_warnings(action="ignore", category=DataWarning):
             return model.simulate(np.tile(u, (count, 1)), x0=state).reshape(count, model.l) - before
     return model.step_response(count).reshape(count, model.l, -1) @ jumps(model, c, low, high)

@@ -1,11 +1,14 @@
 """The scale between f and B, and its sign: f rises where the output of the plant rises."""
 
+from typing import Literal
+
 import numpy as np
 
 from optid.arrays import Array
 from optid.errors import StructureError
 
 GAUGES = ("norm", "gain", "b0", "none")
+Gauge = Literal["norm", "gain", "b0"]  # those that fix the scale
 NEGLIGIBLE = 1e-9  # share of the size of its terms below which a gain counts as zero
 
 
@@ -29,6 +32,18 @@ def gauge_factor(gauge: str, a: Array, b: Array, channel: str) -> float:
         raise StructureError(
             f"gauge {gauge!r} cannot be reached: the {what} of input {channel!r} is zero or infinite; use 'norm'.")
     return scale
+
+
+def in_gauge(gauge: str, mu: Array, b: Array, a: Array, channel: str) -> tuple[Array, Array]:
+    """Return mu (P,) and b (nb,) or (nb, l) of one input, the channel, scaled to satisfy a `Gauge`.
+
+    The coefficients a of A are (na,) or (na, l, l). A quantity that is zero, and that the gauge sets to one, is a
+    `StructureError`.
+    """
+    if gauge == "norm" and not np.any(b):  # an input without effect: any direction will do
+        return np.zeros_like(mu), np.full(b.shape, 1 / np.sqrt(b.size))
+    factor = gauge_factor(gauge, a, b, channel)
+    return mu * factor, b / factor
 
 
 def plant_sign(a: Array, b: Array) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from optid.data.record import Data
-from optid.identify.dynamics import dynamics, input_levels, integrating_pole
+from optid.identify.dynamics import dynamics, input_levels, integration
 from optid.identify.responses import LONGEST, Response, responses, step_samples
 from optid.models.functions import static_functions
 from optid.show.charts import COLOURS, channel_axis, density, response_axis
@@ -125,7 +125,7 @@ def comparison_curves(found: Any) -> tuple[dict[str, list[Response]], list[str]]
     """Return the curves of every model of a comparison between the levels of its record, and why some are missing."""
     record = found.data.raw()
     levels, curves, reasons = record_levels(record), {}, []
-    count = max(step_samples(model, bool(integrating_pole(model)[1]), longest(record)) for model in found.models)
+    count = max(step_samples(model, bool(integration(model)), longest(record)) for model in found.models)
     for name, model in zip(found.names, found.models):
         curves[name], missing = responses(model, levels, count=count)
         reasons += [f"{name}: {reason}" for reason in missing]

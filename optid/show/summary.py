@@ -287,13 +287,13 @@ def noise_table(fit: "Fit") -> Table | None:
     model = fit.model
     if not has_noise(model):
         return None
-    from optid.identify.noise import colour, output_noise
+    from optid.identify.noise import colour, output_deviations
 
     tests: dict[str, Any] = {}
     if isinstance(fit.data, Data):
         with suppress(DataError, StructureError):  # a simulation that diverges, a marginal mode that no output sees
             tests = colour(model, fit.data)
-    spread = np.sqrt(np.diag(output_noise(model)))
+    spread = output_deviations(model)
     own = np.sqrt(np.diag(model.noise.innovation))
     rows = []
     for name, unit, innovation, total in zip(model.outputs, model.output_units, own, spread):

@@ -48,8 +48,7 @@ class Bench:
             "delay": self._delay, "diagnose": self._diagnose}
         if question not in known:
             raise DataError(f"the page sent an unknown request, {question!r}")
-        with SOLVING, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the findings contain them
+        with SOLVING, warnings.catch_warnings(action="ignore"):  # the findings contain them
             try:
                 return known[question](asked)
             except OptidError as error:

@@ -16,12 +16,9 @@ from optid.workbench.views import SHOWN
 
 
 def diagnose_window(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Diagnose a window of a record.
+    """Diagnose a window of a record by a state-space model with noise covariances, or a fit of one.
 
-    Args:
-        source: a state-space model with noise covariances, or a fit of one.
-        data: the whole record.
-        asked: ``experiment``, ``window``, ``kinds`` of faults, ``without`` (labels removed from the dictionary).
+    `asked` has ``experiment``, ``window``, ``kinds`` of faults, ``without`` (labels removed from the dictionary).
     """
     from optid.faults import diagnose, dictionary
 

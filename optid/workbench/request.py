@@ -93,9 +93,7 @@ class Request:
     def fit(self, data: Data, begun: Callable[["Request"], Any] | None = None) -> Any:
         """Fit the record; with a band on the step response by repeated fits, each linearised at the previous model.
 
-        Args:
-            data: the whole record.
-            begun: returns the first fit, that of the same request without bands, if it may be known.
+        `begun` returns the first fit, that of the same request without bands, if it may be known.
         """
         from optid.identify.fitting import fit
 
@@ -120,9 +118,7 @@ def shortest(data: Data) -> int:
 def suggest_state(data: Data, suggestion: Mapping[str, Any]) -> dict[str, Any]:
     """Return the initial state of a page: that of a built-in example, or small orders for any record.
 
-    Args:
-        data: the record.
-        suggestion: arguments of a fit, with constraints as words.
+    The suggestion is arguments of a fit, with constraints as words.
     """
     orders = {"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8"}
     arguments = {key: suggestion.get(key, value) for key, value in orders.items()}

@@ -10,13 +10,7 @@ from optid.workbench.request import BAND, PASSES, ChosenConstraint, Request
 
 
 def script(request: Request, source: str, whole: bool = False) -> str:
-    """Write a fit as a script.
-
-    Args:
-        request: what was fitted.
-        source: expression that reads the whole record.
-        whole: whether its window is the whole record.
-    """
+    """Write a fit as a script; `source` is the expression that reads the record, of which `whole` takes all samples."""
     homes: dict[str, set[str]] = {}
     for c in request.constraints:
         point = entry_point(CONSTRAINTS, c.word)

@@ -157,23 +157,17 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def serve(source: BenchSource, port: int = 0, ready: Callable[[str, Path], None] = print) -> None:
-    """Serve a record until it is interrupted.
+    """Serve a record on a port of 127.0.0.1, by default a free one, until it is interrupted.
 
-    Args:
-        source: the record.
-        port: of 127.0.0.1; any free one by default.
-        ready: called with the address, and with a file, readable by this user only, that redirects to it.
-
-    Raises:
-        DataError: the port is in use, or is not a port.
+    `ready` gets the address, and a file, readable by this user only, that redirects to it. `DataError`: the port is in
+    use, or is not a port.
     """
     try:
         server = Server(source, port)
     except (OSError, OverflowError) as error:
         raise DataError(f"port {port} of 127.0.0.1 cannot be used: "
                         f"{getattr(error, 'strerror', 'it must be 0 to 65535')}") from None
-    with server, TemporaryDirectory(prefix="optid-") as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with server, TemporaryDirectory(prefix="optid-") as folder, warnings.catch_warnings(action="ignore"):
         ready(server.address, server.redirect(Path(folder)))
         try:
             server.serve_forever()

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from refusals import refuses
 
 from optid.data.record import Data
 from optid.errors import LookupFailed
@@ -117,5 +118,4 @@ def test_heater_as_suggested_is_a_good_model_whose_intervals_cover_the_truth(see
 
 def test_unknown_example_names_the_nearest():
     assert example("thruster", seed=0, n=50).data.n_samples == 50
-    with pytest.raises(LookupFailed, match="Did you mean 'thruster'"):
-        example("truster")
+    refuses(LookupFailed, "Did you mean 'thruster'", example, "truster")

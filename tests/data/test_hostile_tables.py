@@ -65,8 +65,7 @@ def attempt(path, seed: int) -> str:
     words = {"inputs": export.channels[0], "outputs": export.channels[1]} | (
         dict(export.words) if r.random() < 0.7 else {}) | (arguments(r) if r.random() < 0.4 else {})
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             if r.random() < 0.8:
                 data = optid.read(path, **words)
                 assert str(data) and data.n_samples and np.isfinite(data.dt) and len(data.to_pandas()) == len(data)

@@ -13,7 +13,8 @@ from scipy.io import savemat
 
 from optid.data.readers import read
 from optid.data.reading import mat_tree
-from optid.data.reading.matlab import _variables, mat_contents
+from optid.data.reading.mat_contents import file_contents
+from optid.data.reading.matlab import mat_contents
 from optid.errors import DataError, DataWarning
 
 N = 40
@@ -389,7 +390,7 @@ def test_links_to_other_files_are_refused(h5, tmp_path):
 def test_h5py_is_named_where_it_is_missing(tmp_path, monkeypatch):
     write_mat(tmp_path / "r.mat", {"u": U, "y": Y}, "7.3")
     monkeypatch.setitem(sys.modules, "h5py", None)
-    refuses(DataError, r'7.3, which needs h5py: pip install "optid\[mat\]"', _variables, tmp_path / "r.mat", None)
+    refuses(DataError, r'7.3, which needs h5py: pip install "optid\[mat\]"', file_contents, tmp_path / "r.mat", None)
 
 
 KINDS = {
@@ -409,8 +410,7 @@ def test_damaged_files_are_read_or_refused_by_name(save, kind, count):
     for bad in bytes_of(path.read_bytes(), count, seed=4):
         path.write_bytes(bad)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DataWarning)
+            with warnings.catch_warnings(action="ignore", category=DataWarning):
                 read(path, *([1, 2] if kind == "to file" else []))
         except DataError as error:
             assert "r.mat" in str(error) or "channel" in str(error), error

@@ -20,8 +20,7 @@ TIME = 0.1 * np.arange(N)
 
 @pytest.fixture(autouse=True)
 def quiet():
-    with warnings.catch_warnings():  # the libraries warn about one another's versions as they write
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):  # the libraries warn about one another's versions as they write
         yield
 
 

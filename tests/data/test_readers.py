@@ -1,3 +1,4 @@
+import re
 import sys
 import time
 from datetime import datetime, timedelta
@@ -163,9 +164,7 @@ def test_dates_are_seconds(tmp_path):
     assert fast.dt == 1e-6
 
 
-@pytest.mark.parametrize(
-    ("t", "arguments", "parts"),
-    [
+@pytest.mark.parametrize(("t", "arguments", "parts"), [
         ([0, 1, 2, 4, 5], {}, ["Sample 3", "t = 4.0", "comes 2 after", "median step is 1", "1.00%",
                                "1 row seems to be lost", "gaps='missing'"]),
         ([0, 1, 2, 2, 3], {}, ["Sample 3", "comes 0 after"]),
@@ -175,22 +174,16 @@ def test_dates_are_seconds(tmp_path):
         ([0, 1, 2], {"dt": 0.1}, ["dt = 0.1", "step by 1", "unit", "time=False"]),
         (["x", "y", "z"], {}, ["neither numbers nor ISO dates", "'x'"]),
         (["0", "", "2"], {}, ["stamp of sample 1 is missing"]),
-        ([True, False, True], {}, ["type bool"]),
-    ],
-)
+        ([True, False, True], {}, ["type bool"])])
 def test_bad_stamps(t, arguments, parts):
-    with pytest.raises(DataError) as error:
-        read(stamped(t), **arguments)
     for part in parts:
-        assert part in str(error.value)
+        refuses(DataError, re.escape(part), read, stamped(t), **arguments)
 
 
 # -- bad files
 
 
-@pytest.mark.parametrize(
-    ("text", "arguments", "parts"),
-    [
+@pytest.mark.parametrize(("text", "arguments", "parts"), [
         ("", {}, ["record.csv is empty", "0 bytes"]),
         ("\n", {}, ["record.csv is empty"]),
         ("u,y\n", {}, ["header but no rows"]),
@@ -215,16 +208,12 @@ def test_bad_stamps(t, arguments, parts):
         ("u,y\n1,2\n", {"experiment": "run"}, ["no column 'run'"]),
         ("u,y\n1,2\n", {"columns": ["u"]}, ["2 columns", "names 1"]),
         ("u,y\n1,2\n", {"decimal": ";"}, ["decimal=';'"]),
-        ("u,y\n1,2\n", {"dt": -1}, ["dt = -1", "positive"]),
-    ],
-)
+        ("u,y\n1,2\n", {"dt": -1}, ["dt = -1", "positive"])])
 @pytest.mark.parametrize("small", [1 << 20, -1])  # read by the csv module; by polars until it refuses
 def test_bad_csv(tmp_path, monkeypatch, text, arguments, parts, small):
     monkeypatch.setattr(csvfile, "SMALL", small)
-    with pytest.raises(DataError) as error:
-        read(write(tmp_path, text), **arguments)
     for part in parts:
-        assert part in str(error.value)
+        refuses(DataError, re.escape(part), read, write(tmp_path, text), **arguments)
 
 
 CELLS = ["1", "-2.5", "1e300", "3e-320", " 4", "5 ", "", "NA", " nan", "Null", "N/A", "inf", "1_0", "x", "0x1", '"7"',
@@ -415,8 +404,7 @@ def test_stream_checks_time_across_chunks(tmp_path):
     assert stream.dt == 0.1 and sum(len(u) for u, _ in stream) == 10
     rows[8] = "0.95,1,2"
     write(tmp_path, "t,u,y\n" + "\n".join(rows))
-    with pytest.raises(DataError, match=r"Sample 8 \(t = 0.95\) comes 0.25 after"):
-        list(open_stream(path, chunk=4))
+    refuses(DataError, r"Sample 8 \(t = 0.95\) comes 0.25 after", lambda: list(open_stream(path, chunk=4)))
     assert sum(len(u) for u, _ in open_stream(path, time=False, chunk=4)) == 10
     stamps = pl.DataFrame({"time": [datetime(2024, 1, 1) + timedelta(seconds=2 * k) for k in range(9)],
                            "u": np.arange(9), "y": np.arange(9)})
@@ -428,15 +416,12 @@ def test_bad_streams(tmp_path):
     refuses(DataError, "chunk must be a positive integer", open_stream, write(tmp_path, CSV), chunk=0)
     refuses(DataError, "no file", open_stream, tmp_path / "missing.npy")
     refuses(DataError, "use read", open_stream, write(tmp_path, "x", "r.mat"))
-    with pytest.raises(DataError, match="no rows"):
-        list(open_stream(write(tmp_path, "u,y\n", "e.csv")))
-    with pytest.raises(DataError, match="'oops'"):
-        list(open_stream(write(tmp_path, "u,y\n1,2\n3,oops\n", "e.csv"), chunk=1))
+    refuses(DataError, "no rows", lambda: list(open_stream(write(tmp_path, "u,y\n", "e.csv"))))
+    refuses(DataError, "'oops'", lambda: list(open_stream(write(tmp_path, "u,y\n1,2\n3,oops\n", "e.csv"), chunk=1)))
     write(tmp_path, "nonsense", "r.parquet")
     refuses(DataError, "not a Parquet file", open_stream, tmp_path / "r.parquet")
     pl.DataFrame({"u": ["a"], "y": [1.0]}).write_parquet(tmp_path / "r.parquet")
-    with pytest.raises(DataError, match="column 'u', row 1 holds 'a', not a number"):
-        list(open_stream(tmp_path / "r.parquet"))
+    refuses(DataError, "column 'u', row 1 holds 'a', not a number", lambda: list(open_stream(tmp_path / "r.parquet")))
     for array, message in [
         (np.ones((2, 9)), "more channels than samples"),
         (np.ones((0, 2)), r"shape \(0, 2\)"),

@@ -130,9 +130,7 @@ def test_steps_go_up_and_down():
     np.testing.assert_array_equal(signals.steps(11, 0, 2, levels=3, hold=2), [0, 0, 1, 1, 2, 2, 1, 1, 0, 0, 1])
 
 
-@pytest.mark.parametrize(
-    ("call", "part"),
-    [
+@pytest.mark.parametrize(("call", "part"), [
         (lambda: signals.multisine(100, periods=3), "whole periods"),
         (lambda: signals.multisine(100, lines=[0, 3]), "from 1 to 49"),
         (lambda: signals.multisine(100, lines=[50]), "from 1 to 49"),
@@ -153,8 +151,6 @@ def test_steps_go_up_and_down():
         (lambda: signals.band_limited_noise(100, cutoff=(0.3, 0.2)), "rising order"),
         (lambda: signals.band_limited_noise(100, cutoff=0.2, clip=0.0), "clip = 0.0"),
         (lambda: signals.uniform_levels(100, levels=1), "levels must be .* at least 2"),
-        (lambda: signals.steps(5, levels=4), "cannot hold 7 steps"),
-    ],
-)
+        (lambda: signals.steps(5, levels=4), "cannot hold 7 steps")])
 def test_bad_arguments(call, part):
     refuses(StructureError, part, call)

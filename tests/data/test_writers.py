@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refuses
 from typer.testing import CliRunner
 
 import optid
@@ -62,8 +63,7 @@ def test_what_would_be_read_as_something_else_is_refused_and_no_file_is_touched(
     path.write_text("kept")
     data = optid.Data(np.arange(9.0), np.arange(9.0) ** 2, 0.5, inputs=names[:1], outputs=names[1:],
                       input_units=units[:1], output_units=units[1:])
-    with pytest.raises(DataError, match=message):
-        data.to_csv(path)
+    refuses(DataError, message, data.to_csv, path)
     assert path.read_text() == "kept"
 
 

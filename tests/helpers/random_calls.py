@@ -107,8 +107,7 @@ def trouble(seed: int) -> str:
     (u, y), name, given = draw(seed)
     kept = [np.array(x, copy=True) if isinstance(x, np.ndarray) else x for x in (u, y)]
     said = f"{seed}: {name} {given}"
-    with warnings.catch_warnings(record=True) as heard, limited(60):
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as heard, limited(60):
         try:
             fit = optid.fit(optid.Data(u, y), name, **given)
             str(fit), fit.verdict

@@ -113,8 +113,7 @@ def make_files(folder: Path) -> dict[str, list[Path]]:
     optid.fit(data, na=1, nb=1, basis="triangular:5", prove=False).model.save(folder / "arx.json")
     broken = optid.Data(u=u, y=y + np.where(np.arange(120) > 60, 0.5, 0.0)[:, None], dt=0.1, inputs=["u1"],
                         outputs=["y1"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         ss = optid.fit(data, "hammerstein_ss.asivid", nx=2, basis=optid.Polynomial(3), prove=False).model
         ss.save(folder / "ss.json")
         diagnose(ss, broken, dictionary(ss, kinds=["bias"])).save(folder / "d.json")

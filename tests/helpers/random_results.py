@@ -167,8 +167,7 @@ def troubles(seed: int, folder: Path) -> list[str] | None:
     """Fit, and use the result in every way; return what fails, None where optid refuses the fit with a reason."""
     system, data, name, given = draw(seed)
     said = f"{seed}: {system} {data.n_samples}x{data.m}x{data.l} {name} {given}"
-    with warnings.catch_warnings(), limited(120):
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning), limited(120):
         try:
             fit = optid.fit(data, name, **given)
         except OptidError:
@@ -177,8 +176,7 @@ def troubles(seed: int, folder: Path) -> list[str] | None:
             return [f"{said}: fit: {type(error).__name__}: {error}"[:500]]
     found = []
     for what, use in uses(fit, folder, seed).items():
-        with warnings.catch_warnings(), limited(120):
-            warnings.simplefilter("ignore", DataWarning)
+        with warnings.catch_warnings(action="ignore", category=DataWarning), limited(120):
             try:
                 if wrong := use():
                     found.append(f"{said}: {what}: {wrong}")

@@ -5,8 +5,10 @@ from typing import Any
 
 import pytest
 
+Errors = type[Exception] | tuple[type[Exception], ...]
 
-def refuses(error: type[Exception], words: str, function: Callable[..., Any], *arguments: Any, **settings: Any) -> None:
+
+def refuses(error: Errors, words: str, function: Callable[..., Any], *arguments: Any, **settings: Any) -> None:
     """Assert that a call raises this error, with a message that matches the words, a regular expression."""
     with pytest.raises(error, match=words):
         function(*arguments, **settings)

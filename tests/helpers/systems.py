@@ -3,6 +3,7 @@
 import numpy as np
 
 from optid.bases import BSpline, Linear, PiecewiseConstant, Polynomial, Triangular, Trigonometric
+from optid.data.record import Data
 from optid.models import HammersteinTF, Nonlinearity
 
 BASES = [Triangular(7),
@@ -68,3 +69,10 @@ def by_hand(model, u, y_past=None, w_past=None, noise=None):
             for j, row in enumerate(model.b[c].reshape(-1, model.l)):
                 y[k] += row * f[k - model.nk[c] - j, c]
     return y[n:]
+
+
+def record(model, count=400, seed=1, noise=0.1):
+    """A record of a model with white equation errors."""
+    u = inputs(model, count, seed)
+    e = noise * np.random.default_rng(seed + 100).normal(size=(count, model.l))
+    return Data(u, by_hand(model, u, noise=e), dt=model.dt, name="rig")

@@ -1,35 +1,24 @@
 """Several models on one page, prediction horizons, and what validation says of models with feedback."""
 
 import re
-import warnings
 
 import numpy as np
 import pytest
-from systems import by_hand, inputs, mimo, siso
+from refusals import refuses
+from systems import mimo, record, siso
 from typer.testing import CliRunner
 
 import optid
 from optid import report
 from optid.cli.app import app
 from optid.data.record import Data
-from optid.errors import DataError, DataWarning, StructureError
+from optid.errors import DataError, StructureError
 from optid.identify.validation import compare_models, fit_by_horizon, fit_percent, validate
 from optid.identify.validation.correlations import autocorrelation
 from optid.models import HammersteinTF, Nonlinearity
 from optid.models.hammerstein_ss import HammersteinSS
 
-
-@pytest.fixture(autouse=True)
-def quiet():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
-        yield
-
-
-def record(model, count=400, seed=1, noise=0.1):
-    u = inputs(model, count, seed)
-    e = noise * np.random.default_rng(seed + 100).normal(size=(count, model.l))
-    return Data(u, by_hand(model, u, noise=e), dt=model.dt, name="rig")
+pytestmark = pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
 
 
 def worse(model: HammersteinTF) -> HammersteinTF:
@@ -53,10 +42,8 @@ def test_the_curve_is_the_fit_of_predictions_over_common_samples():
     assert np.all(np.diff(curve.fits[:, 0]) < 0) and curve.simulation[0] < curve.fits[0, 0]
     text = str(curve)
     assert f"{curve.fits[1, 0]:.2f}" in text and "simulation" in text
-    with pytest.raises(StructureError, match="horizon must be a positive integer"):
-        fit_by_horizon(model, data, [0])
-    with pytest.raises(DataError, match="100 samples ahead"):
-        fit_by_horizon(model, data.window(0, 50), [100])
+    refuses(StructureError, "horizon must be a positive integer", fit_by_horizon, model, data, [0])
+    refuses(DataError, "100 samples ahead", lambda: fit_by_horizon(model, data.window(0, 50), [100]))
 
 
 @pytest.mark.slow
@@ -114,10 +101,8 @@ def test_models_are_compared_over_the_samples_that_all_predict():
         kept = np.where(common, np.nan, one.predict(data))
         assert found.fits["one step"][i] == pytest.approx(fit_percent(data.y, kept))
     assert found.best() == "true" and found.best("2 steps") == "true" and "Best simulation: true" in str(found)
-    with pytest.raises(StructureError, match="no model has the prediction 'measured feedback'"):
-        found.best("measured feedback")
-    with pytest.raises(StructureError, match="no model"):
-        compare_models({}, data)
+    refuses(StructureError, "no model has the prediction 'measured feedback'", found.best, "measured feedback")
+    refuses(StructureError, "no model", compare_models, {}, data)
 
 
 def test_models_without_names_are_named_by_what_they_are():

@@ -197,36 +197,27 @@ def test_records_that_will_not_do(data, error, words):
 
 # numbers that are none
 
-BAD = {"na": [np.inf, np.nan, 10**20, 10**400, 10**5000, -10**5000, 1.5, True, np.array(2.0), 1j],
-       "nb": [np.inf, 1e400, 10**5000, np.array(2.0), [1, np.nan]], "nk": [np.nan, 10**5000, np.array(0.0)],
-       "ridge": [np.inf, np.nan, 10**400, 10**5000, np.float32(np.inf), True, 1j],
-       "curvature": [np.float32(np.inf), -1],
-       "accuracy": [0, 1, -1, np.inf, np.nan, 10**5000, "x", None, np.float32(np.inf)],
-       "time_limit": [0, -1, np.nan, -np.inf, -10**5000, "x", True], "gauge": [np.array([1, 2]), 3, np.nan],
-       "basis": [10**5000, np.nan, np.inf, np.array([1, 2])], "loss": [np.nan, 10**5000]}
+BAD = [
+    ("hammerstein_arx.exact", STRUCTURE, {
+        "na": [np.inf, np.nan, 10**20, 10**400, 10**5000, -10**5000, 1.5, True, np.array(2.0), 1j],
+        "nb": [np.inf, 1e400, 10**5000, np.array(2.0), [1, np.nan]], "nk": [np.nan, 10**5000, np.array(0.0)],
+        "ridge": [np.inf, np.nan, 10**400, 10**5000, np.float32(np.inf), True, 1j],
+        "curvature": [np.float32(np.inf), -1],
+        "accuracy": [0, 1, -1, np.inf, np.nan, 10**5000, "x", None, np.float32(np.inf)],
+        "time_limit": [0, -1, np.nan, -np.inf, -10**5000, "x", True], "gauge": [np.array([1, 2]), 3, np.nan],
+        "basis": [10**5000, np.nan, np.inf, np.array([1, 2])], "loss": [np.nan, 10**5000]}),
+    ("armax.exact", {"na": 1, "nb": 1, "nc": 1}, {
+        "seed": [-1, np.inf, 10**5000, 1.5], "starts": [10**5000], "offset": ["x"], "nc": [[1, 2], np.array([1, 2])]}),
+    ("ss.exact", {"nx": 1}, {
+        "feedthrough": [0, np.nan, None], "initial": [3, ["x"], None], "block_rows": [np.inf, "x", 6.5],
+        "iterations": [np.inf], "nx": [np.array([1, 2])]})]
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_a_value_that_is_no_number_or_too_large_is_named(name):
-    for value in BAD[name]:
-        refuses(StructureError, name, optid.fit, record(count=100), **{**STRUCTURE, name: value})
-
-
-@pytest.mark.parametrize("change", [
-    {"seed": -1}, {"seed": np.inf}, {"seed": 10**5000}, {"seed": 1.5}, {"starts": 10**5000}, {"offset": "x"},
-    {"nc": [1, 2]}, {"nc": np.array([1, 2])}])
-def test_arguments_of_a_descent_are_named(change):
-    (name,) = change
-    refuses(StructureError, name, optid.fit, record(count=100), "armax.exact", **{"na": 1, "nb": 1, "nc": 1} | change)
-
-
-@pytest.mark.parametrize("change", [
-    {"feedthrough": 0}, {"feedthrough": np.nan}, {"feedthrough": None}, {"initial": 3}, {"initial": ["x"]},
-    {"initial": None}, {"block_rows": np.inf}, {"block_rows": "x"}, {"block_rows": 6.5},
-    {"iterations": np.inf}, {"nx": np.array([1, 2])}])
-def test_arguments_of_a_state_space_fit_are_named(change):
-    (name,) = change
-    refuses(StructureError, name, optid.fit, record(count=100), "ss.exact", **{"nx": 1} | change)
+@pytest.mark.parametrize(("formulation", "structure", "name", "values"), [
+    (formulation, structure, name, values) for formulation, structure, bad in BAD for name, values in bad.items()])
+def test_a_value_that_is_no_number_or_too_large_is_named(formulation, structure, name, values):
+    for value in values:
+        refuses(StructureError, name, optid.fit, record(count=100), formulation, **{**structure, name: value})
 
 
 def test_what_an_annotation_excludes_is_said_in_words():

@@ -3,21 +3,22 @@
 import re
 import signal
 import warnings
+from contextlib import closing
 from dataclasses import replace
 from time import process_time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from refusals import refuses
 from scipy.signal import lfilter
 from tasks import anonymous, die_of_one, fail, hang, slow_square
 
 import optid
-from optid.bases import Linear
 from optid.errors import DataError, DataWarning, OptidError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks, join_parts, pooled_fit
 from optid.identify.informativity import Informativity
-from optid.identify.lag_sums import LagSums, linear, scan
+from optid.identify.lag_sums import LagSums, scan
 from optid.identify.search import identify
 from optid.identify.search import search as searching
 from optid.identify.search import trial as trying
@@ -95,8 +96,7 @@ def test_borders_of_experiments_are_borders_of_blocks_where_they_are_near():
 
 
 def test_a_record_too_short_for_the_blocks_is_refused():
-    with pytest.raises(RankError, match="30 samples are too few for cross-validation in 4 blocks"):
-        Blocks.of(plant(30), 4)
+    refuses(RankError, "30 samples are too few for cross-validation in 4 blocks", lambda: Blocks.of(plant(30), 4))
 
 
 @pytest.mark.parametrize("block, first", [(0, 0), (1, 50), (3, 200)])
@@ -176,7 +176,7 @@ def test_a_run_that_leaves_the_range_counts_as_infinite():
 def test_the_sums_without_a_block_are_those_of_the_record_without_it():
     data = plant(300, noise=0.1)
     blocks = Blocks.of(data, 3)
-    sums = LagSums(blocks, linear(data), na=3, lags=4)
+    sums = LagSums(blocks, na=3, lags=4)
     for b, block in enumerate(sums.blocks):
         direct = collect(blocks.without(b), sums.layout)
         np.testing.assert_allclose(sums.whole.gram - block.gram, direct.gram, rtol=1e-9, atol=1e-8)
@@ -186,7 +186,7 @@ def test_the_sums_without_a_block_are_those_of_the_record_without_it():
 def test_errors_of_smaller_structures_are_those_of_fits_without_the_blocks():
     data = plant(400, delay=1, noise=0.1)
     blocks = Blocks.of(data, 4)
-    sums = LagSums(blocks, linear(data), na=4, lags=6)
+    sums = LagSums(blocks, na=4, lags=6)
     na, nb, nk = 2, 3, (1,)
     total, rows = 0.0, 0
     reach = sums.layout.first_row
@@ -443,8 +443,7 @@ def test_inputs_of_two_levels_allow_no_functions_of_them(short):
     y = np.convolve(u, 0.8 ** np.arange(40))[:300] + 0.1 * rng.normal(size=300)
     found = identify(optid.Data(u, y), classes=KINDS[:2], workers=1)
     assert INPUTS not in {t.candidate.kind for t in found.trials} and "two levels" in found.reasons[-1]
-    with pytest.raises(StructureError, match="add 'linear'"):
-        identify(optid.Data(u, y), classes=[INPUTS])
+    refuses(StructureError, "add 'linear'", lambda: identify(optid.Data(u, y), classes=[INPUTS]))
 
 
 @pytest.mark.filterwarnings("ignore:too few levels")
@@ -475,20 +474,15 @@ def test_a_basis_has_no_more_functions_than_the_samples_determine():
     ({"constraints": ["monotonous"]}, OptidError, "monotonous"),
 ])
 def test_arguments_that_cannot_be_are_refused(changes, error, words):
-    with pytest.raises(error, match=words):
-        identify(plant(200), **{"workers": 1, **changes})
+    refuses(error, words, lambda: identify(plant(200), **{"workers": 1, **changes}))
 
 
 def test_bad_records_are_refused(short):
-    with pytest.raises(DataError, match="identify takes optid.Data"):
-        identify(np.zeros(10))
-    with pytest.raises(RankError, match="too few for cross-validation"):
-        identify(plant(25))
+    refuses(DataError, "identify takes optid.Data", lambda: identify(np.zeros(10)))
+    refuses(RankError, "too few for cross-validation", lambda: identify(plant(25)))
     u = np.random.default_rng(0).normal(size=200)
-    with pytest.raises((DataError, SolverFailed), match="constant"):
-        identify(optid.Data(u, np.ones(200)), workers=1)
-    with pytest.raises((DataError, SolverFailed), match="constant"):
-        identify(optid.Data(np.ones(200), u), workers=1)
+    refuses((DataError, SolverFailed), "constant", lambda: identify(optid.Data(u, np.ones(200)), workers=1))
+    refuses((DataError, SolverFailed), "constant", lambda: identify(optid.Data(np.ones(200), u), workers=1))
 
 
 def test_missing_samples_are_left_out(short):
@@ -496,8 +490,7 @@ def test_missing_samples_are_left_out(short):
     u, y = np.array(data.u).ravel(), np.array(data.y).ravel()
     y[100:140] = np.nan
     u[300:303] = np.nan
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         found = identify(optid.Data(u, y), classes=[LINEAR], workers=1)
     assert found.chosen.score > 90
 
@@ -518,37 +511,28 @@ def test_two_outputs():
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_pool_returns_results_in_order_and_stops_at_its_deadline(count):
     told = []
-    pool = TrialPool(slow_square, count)
-    try:
+    with closing(TrialPool(slow_square, count)) as pool:
         assert pool.run(range(7), lambda: FOREVER, told.append) == [x * x for x in range(7)]
         assert sorted(told) == [x * x for x in range(7)]
         assert pool.run(range(3), lambda: -1.0, told.append) == [None] * 3
-    finally:
-        pool.close()
 
 
 def test_a_pool_survives_the_death_of_a_process():
-    pool = TrialPool(die_of_one, 2)
-    try:
+    with closing(TrialPool(die_of_one, 2)) as pool:
         found = pool.run([0, 1, 2, 3], lambda: FOREVER, lambda result: None)
         assert found[1] is None and [x for x in found if x is not None] == [0, 2, 3]
-    finally:
-        pool.close()
 
 
 def test_what_hangs_ends_with_the_time(monkeypatch):
     monkeypatch.setattr("optid.identify.search.pool.GRACE", 3.0)
-    pool = TrialPool(hang, 2)
-    assert pool.run([0, 1], lambda: 1e-6, lambda result: None) == [0, None]
-    pool.close()
+    with closing(TrialPool(hang, 2)) as pool:
+        assert pool.run([0, 1], lambda: 1e-6, lambda result: None) == [0, None]
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_a_trial_raises_in_a_process_is_raised_here(count):
-    pool = TrialPool(fail, count)
-    with pytest.raises(ZeroDivisionError, match="of 7"):
-        pool.run([7], lambda: FOREVER, lambda result: None)
-    pool.close()
+    with closing(TrialPool(fail, count)) as pool:
+        refuses(ZeroDivisionError, "of 7", pool.run, [7], lambda: FOREVER, lambda result: None)
 
 
 def test_a_constraint_that_no_process_can_import_is_refused_by_its_name_or_leaves_the_search_alone(monkeypatch, short):
@@ -572,13 +556,12 @@ def test_nothing_that_can_be_fitted_is_an_error_with_the_most_frequent_reason(mo
         return Trial(candidate, reason="RankError: too short")
 
     monkeypatch.setattr(searching, "run_trial", refuse)
-    with pytest.raises(SolverFailed, match="most often: RankError: too short"):
-        identify(plant(200), workers=1)
+    refuses(SolverFailed, "most often: RankError: too short", lambda: identify(plant(200), workers=1))
 
 
 def test_layouts_of_the_sums_hold_every_lag():
     data = plant(200)
-    sums = LagSums(Blocks.of(data), (Linear(),), na=2, lags=3)
+    sums = LagSums(Blocks.of(data), na=2, lags=3)
     assert isinstance(sums.layout, Layout)
     assert sums.columns(1, 2, (1,)).tolist() == [0, 3, 4, 5]
 
@@ -598,8 +581,7 @@ def test_a_search_goes_on_from_the_file_of_its_trials(tmp_path, monkeypatch):
     with pytest.raises(DataError, match="of another record"):
         identify(plant(400, seed=1), classes=KINDS[:2], workers=1, trials=file)
     file.write_text("{}")
-    with pytest.raises(OptidError, match="trials.json"):
-        identify(data, classes=KINDS[:2], workers=1, trials=file)
+    refuses(OptidError, "trials.json", identify, data, classes=KINDS[:2], workers=1, trials=file)
 
 
 @pytest.mark.slow

@@ -169,8 +169,7 @@ def test_wrong_noise_model_does_not_hide_the_errors_of_its_simulation():
 
 
 def quietly(build):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         return build()
 
 
@@ -255,8 +254,7 @@ def test_misfit_and_extrapolation_are_said():
     data = optid.Data(u, lfilter([0, 1.0, 0.6, 0.4, 0.3], [1, -0.5], u + 0.8 * u**2) + 0.02 * rng.standard_normal(600))
     fit = quiet(data, na=1, nb=1, nk=1, basis=optid.Polynomial(2, interval=(-1.0, 1.0)), prove=False)
     assert fit.verdict.misfits
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         found = fit.simulate(2 * u, interval=0.95)
     assert [str(one.message) for one in caught] == list(found.notes)
     assert "misfit" in found.notes[0] and "extrapolation" in found.notes[1]

@@ -72,8 +72,7 @@ def test_a_damaged_cache_is_told_and_replaced(kernel, tmp_path, ending, damage):
     kernel()(X)
     (path,) = files(tmp_path, ending)
     damage(path)
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as heard:
         assert kernel()(X) == 10.0
     assert {w.category for w in heard} <= {DataWarning} and len(heard) <= 1
     if damage is not flip or ending == "nbc":  # a flipped bit of the index may name another signature

@@ -33,8 +33,7 @@ def plant(n=600, seed=0):
 
 
 def test_it_passes_the_checks_of_scikit_learn_where_a_time_series_allows():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         found = check_estimator(HammersteinRegressor("arx", basis=None), expected_failed_checks=TIME, on_skip=None,
                                 on_fail=None)
     failed = [(one["check_name"], str(one["exception"])) for one in found if one["status"] == "failed"]
@@ -76,7 +75,6 @@ def test_several_outputs_and_constraints():
     u, y = plant()
     both = HammersteinRegressor(constraints=["monotone:increasing"]).fit(u, y)
     assert [price.name for price in both.fit_.prices] == ["monotone:increasing"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         several = HammersteinRegressor("arx", basis=None).fit(u, np.c_[y, -y + 0.01 * u[:, 0]])
     assert several.predict(u).shape == (600, 2)

@@ -14,7 +14,7 @@ from test_reduction import STRUCTURE, assert_same_fit, frame_of, record_folders,
 
 import optid
 from optid.data import clusters
-from optid.data.clusters import check_workers, connect_cluster, difference
+from optid.data.clusters import check_workers, connect_cluster
 from optid.errors import ClusterError, DataError, RankError
 from optid.statistics import Layout, collect
 
@@ -254,13 +254,6 @@ def test_a_real_worker_with_another_solver_is_refused(tmp_path):
         finally:
             worker.kill()
             worker.wait()
-
-
-def test_differences_are_listed_by_package():
-    here = {"python": "3.11", "numpy": "2.0", "scs": "3.2"}
-    assert difference(here, dict(here)) == ""
-    assert difference(here, {"python": "3.11", "numpy": "1.26"}) == (
-        "numpy: 2.0 here, 1.26 there, scs: 3.2 here, not installed there")
 
 
 def test_the_versions_of_a_process_without_optid_can_be_read(tmp_path):

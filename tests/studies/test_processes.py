@@ -293,7 +293,7 @@ def test_a_process_without_work_ends_after_a_while(tmp_path):
 @pytest.mark.parametrize("end, words", [("die", "crashed .signal SIGABRT"), ("sleep", "took more than 0.2 s")])
 def test_a_mat_file_that_kills_its_reader_is_a_named_error(tmp_path, monkeypatch, end, words):
     (tmp_path / "r.mat").write_bytes(b"x" * 200)
-    monkeypatch.setattr(matlab, "_variables", {"die": abort, "sleep": sleep}[end])
+    monkeypatch.setattr(matlab, "file_contents", {"die": abort, "sleep": sleep}[end])
     monkeypatch.setattr(matlab, "SECONDS", 0.2)
     with pytest.raises(DataError, match=f"r.mat is damaged, or not a MAT file: .*{words}"):
         read(tmp_path / "r.mat")

@@ -69,26 +69,17 @@ class NoStamps(UnreadStamps):
 
 @dataclass(frozen=True)
 class TimeColumn:
-    """How the stamps of a record are read from its columns.
+    """How the stamps of a record are read from its columns."""
 
-    Attributes:
-        columns: the column, or those of the date and of the time of day.
-        kind: "numbers", "digits" (numbers that spell dates), "dates" (text), "times of day" (text) or "ready" (dates or
-            durations already).
-        scale: seconds in a unit of numbers.
-        origin: number of 1970-01-01; None where the numbers count from an unknown instant.
-        forms: format of each column of text.
-        how: format of the table.
-        finding: what was recognised and is worth saying.
-    """
-
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # the column, or those of the date and of the time of day
+    # "numbers", "digits" (numbers that spell dates), "dates" (text), "times of day" (text) or "ready" (dates or
+    # durations already)
     kind: str
-    how: Format
-    scale: float = 1.0
-    origin: float | None = None
-    forms: tuple[str, ...] = ()
-    finding: str = ""
+    how: Format  # format of the table
+    scale: float = 1.0  # seconds in a unit of numbers
+    origin: float | None = None  # number of 1970-01-01; None where the numbers count from an unknown instant
+    forms: tuple[str, ...] = ()  # format of each column of text
+    finding: str = ""  # what was recognised and is worth saying
 
     def stamps(self, block: Mapping[str, Any], label: str) -> np.ndarray:
         """Return the stamps (N,) of a block: seconds as float64, or dates and durations in nanoseconds; NaN or NaT.
@@ -218,18 +209,10 @@ def is_rate_name(name: str) -> bool:
 
 def clock_columns(known: Sequence[str], time: Any, taken: Sequence[str], label: str, index: str | None = None,
                   dated: Sequence[str] = ()) -> list[str]:
-    """Return the columns that may hold the clock, the likeliest first.
+    """Return the columns that may hold the clock, the likeliest first; `DataError` if there is no such column.
 
-    Args:
-        known: columns of the source.
-        time: a column, or two of a date and a time of day; None looks for one, True requires it, False ignores it.
-        taken: columns of inputs and outputs.
-        label: name of the source, for the message.
-        index: name of a time index, which need not be among the columns.
-        dated: columns that hold dates.
-
-    Raises:
-        DataError: no such column.
+    `time` is a column, or two of a date and a time of day; None looks for one, True requires it, False ignores it.
+    `taken` are the inputs and outputs, `dated` the columns of dates; the time index need not be among the known ones.
     """
     if time is False:
         return []
@@ -249,17 +232,9 @@ def clock_columns(known: Sequence[str], time: Any, taken: Sequence[str], label: 
 
 
 def recognise(values: Any, name: str, how: Format, label: str, unit: str = "") -> TimeColumn:
-    """Return the clock that some samples of a column show.
+    """Return the clock that samples (N,) of a column show: numbers, dates, texts or a series of texts.
 
-    Args:
-        values: (N,) samples: numbers, dates, texts or a series of texts.
-        name: of the column.
-        how: format of the table.
-        label: name of the source, for messages.
-        unit: unit of the column, where the source tells it.
-
-    Raises:
-        DataError: neither numbers, dates nor times of day, or dates of a format that a user must name.
+    `DataError`: neither numbers, dates nor times of day, or dates of a format that a user must name.
     """
     where = f"{label}, column {name!r}"
     head = np.ravel(values[:2000])

@@ -1,6 +1,7 @@
 """The columns of inputs, outputs and quality, and the one conversion of cells to numbers."""
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -85,6 +86,12 @@ def position_names(columns: Sequence[str] | None, width: int, label: str) -> lis
     if columns is not None and len(columns) != width:
         raise DataError(f"{label} has {width} columns, columns= names {len(columns)}.")
     return [str(c) for c in (range(width) if columns is None else columns)]
+
+
+def check_unique(names: Iterable[str], label: str) -> None:
+    """Refuse two columns of one name (`DataError`)."""
+    if several := [name for name, count in Counter(names).items() if count > 1]:
+        raise DataError(f"{label} has two columns named {several[0]!r}: rename one.")
 
 
 def listing(known: Sequence[str]) -> str:
@@ -199,13 +206,8 @@ def cell_error(where: str, cell: str, how: Format, around: Sequence[Sequence[str
                row: Sequence[str] = ()) -> DataError:
     """Return the error about a cell that is no number, with what to type.
 
-    Args:
-        where: source, column and row.
-        cell: its text.
-        how: the format by which it was read.
-        around: columns of cells of the same rows, which may hold further words of missing samples.
-        advice: what the layout of the file proposes.
-        row: the cells of its row, that of the clock among them.
+    `around` are columns of cells of the same rows, which may hold further words of missing samples; `row` are the cells
+    of its row, that of the clock among them; `advice` is what the layout of the file proposes.
     """
     text, words = cell.strip(), dict[str, Any]()
     if text.lower() in _SWITCH:

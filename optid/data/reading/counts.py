@@ -41,32 +41,18 @@ DIGITS = {8: "%Y%m%d", 10: "%Y%m%d%H", 12: "%Y%m%d%H%M", 14: "%Y%m%d%H%M%S"}
 
 @dataclass(frozen=True)
 class Meaning:
-    """What the numbers of a clock mean.
+    """What the numbers of a clock mean."""
 
-    Attributes:
-        scale: seconds in their unit.
-        origin: number of 1970-01-01; None where they count from an unknown instant.
-        finding: what is worth saying; empty where they are seconds.
-    """
-
-    scale: float = 1.0
-    origin: float | None = None
-    finding: str = ""
+    scale: float = 1.0  # seconds in their unit
+    origin: float | None = None  # number of 1970-01-01; None where they count from an unknown instant
+    finding: str = ""  # what is worth saying; empty where they are seconds
 
 
 def meaning(values: np.ndarray, name: str, base: str, unit: str, word: str | None, where: str) -> Meaning:
     """Return what the numbers (N,) of a clock mean, by their size, their spacing and the name of the column.
 
-    Args:
-        values: the numbers, finite.
-        name: of the column, for findings.
-        base: the name without its unit, in lower case.
-        unit: unit that the name or the source tells, a key of `UNITS`, or "".
-        word: a key of `COUNTS` that the user gave.
-        where: source and column, for errors.
-
-    Raises:
-        DataError: numbers that are dates in digits, or whose size contradicts the unit of their name.
+    `base` is that name without its unit, in lower case; `unit` a key of `UNITS` or "", `word` a key of `COUNTS` that
+    the user gave. `DataError`: numbers that are dates in digits, or whose size contradicts the unit of their name.
     """
     if word is not None:
         return Meaning(COUNTS[word].scale, COUNTS[word].zero, f"clock {name!r}: {COUNTS[word].about}")

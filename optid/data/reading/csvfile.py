@@ -9,7 +9,7 @@ import csv
 import io
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, islice
 from operator import itemgetter
@@ -205,6 +205,8 @@ class CsvFile:
 
 def open_csv(path: Path, how: Format) -> CsvFile:
     """Find the layout of a text table; errors as of `find_layout`."""
+    if path.suffix.lower() == ".tsv" and not how.delimiter:
+        how = replace(how, delimiter="\t")
     return CsvFile(path, find_layout(path, how))
 
 

@@ -60,15 +60,8 @@ def is_unambiguous(form: str) -> bool:
 def parse(text: Any, form: str, label: str) -> tuple[np.ndarray, bool]:
     """Return dates (N,) as datetime64[ns] (UTC where they have an offset) and whether they have one.
 
-    Blank text is NaT. A time of day counts from 1970-01-01.
-
-    Args:
-        text: (N,) texts, or a series of polars.
-        form: format in the notation of `strptime`.
-        label: of the column, for messages.
-
-    Raises:
-        DataError: an impossible format, or a text of another format, with its row.
+    Blank text is NaT, a time of day counts from 1970-01-01. `form` is in the notation of `strptime`, `label` that of
+    the column. `DataError`: an impossible format, or a text of another format, with its row.
     """
     import polars as pl
 

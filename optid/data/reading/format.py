@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from optid import arrays
 from optid.arrays import check_integer
 from optid.errors import DataError, nearest
 
@@ -96,7 +97,7 @@ class Format:
         if self.encoding is not None:
             _check_encoding(self.encoding)
         tolerance = self.time_tolerance
-        if isinstance(tolerance, bool) or not isinstance(tolerance, int | float | np.number) or not 0 <= tolerance < 1:
+        if not arrays.is_number(tolerance) or not 0 <= tolerance < 1:
             raise DataError(f"time_tolerance={tolerance!r}: must be a share of the sampling time of at least 0 and "
                             "below 1, such as 0.05.")
         if self.gaps is not None and self.gaps not in GAPS:
@@ -123,6 +124,10 @@ class Format:
         """Whether a cell is a missing sample."""
         word = cell.strip().lower()
         return word in MISSING or word in self.marks
+
+    def is_comment(self, line: str) -> bool:
+        """Whether a line is a comment."""
+        return self.comment is not None and line.lstrip().startswith(self.comment)
 
     @cached_property
     def marks(self) -> frozenset[str]:

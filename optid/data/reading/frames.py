@@ -7,6 +7,7 @@ import numpy as np
 
 from optid.arrays import check_integers
 from optid.data.reading.clock import clock_values, is_time_name
+from optid.data.reading.columns import check_unique
 from optid.data.reading.dates import is_date
 from optid.errors import DataError
 
@@ -31,9 +32,7 @@ def frame_names(label: str, frame: Any) -> tuple[list[str], Any]:
                         "y=).") from None
     except (ValueError, nw.exceptions.NarwhalsError) as error:
         raise DataError(f"{label} cannot be read: {error}") from error
-    if len(set(names)) < len(names):
-        double = next(name for k, name in enumerate(names) if name in names[:k])
-        raise DataError(f"{label} has two columns named {double!r}: rename one.")
+    check_unique(names, label)
     half = [k for k, name in enumerate(names) if any("\ud800" <= sign <= "\udfff" for sign in name)]
     if half:  # on which pandas fails wherever it infers the type of the names
         raise DataError(f"{label}: the name of column {half[0]} is {names[half[0]]!r}, which holds half a character; "

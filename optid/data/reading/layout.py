@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 from optid.data.reading import dates
 from optid.data.reading.clock import clock_hints
+from optid.data.reading.columns import check_unique, position_names
 from optid.data.reading.format import Format, call, is_number
 from optid.data.reading.textfile import open_text
 from optid.errors import DataError
@@ -84,7 +85,7 @@ def find_layout(path: Path, how: Format) -> TextLayout:
     start = sum(map(len, lines[:first]))
     usual = 50 * max(map(len, lines[first : first + 3])) + LONGEST_LINE
     lines = lines[: next((k for k, line in enumerate(lines) if k > first and len(line) > usual), len(lines))]
-    body = [line for line in lines[first:] if not _is_comment(line, how)][:SAMPLE]
+    body = [line for line in lines[first:] if not how.is_comment(line)][:SAMPLE]
     if not any(line.strip() for line in body):
         raise DataError(f"{where} is empty: it must have a header row and at least one row of numbers.")
     delimiter, width = (how.delimiter, 0) if how.delimiter else _delimiter(body, where)
@@ -114,10 +115,6 @@ def _declared(lines: list[str], how: Format) -> tuple[Format, int]:
     known = {"delimiter": how.delimiter or marks.get(words.get("Separator", ""), "\t"),
              "decimal": words.get("Decimal_Separator", how.decimal).strip()[:1] or how.decimal}
     return replace(how, **known), ends[-1] + 1 if ends and not how.skip_rows else 0
-
-
-def _is_comment(line: str, how: Format) -> bool:
-    return how.comment is not None and line.lstrip().startswith(how.comment)
 
 
 def _delimiter(lines: Sequence[str], where: str) -> tuple[str, int]:
@@ -154,7 +151,7 @@ def _rows(lines: Sequence[str], first: int, start: int, how: Format, where: str)
     def read_named() -> Any:
         for line in lines:
             taken[0], taken[1] = taken[0] + 1, taken[1] + len(line)
-            if not _is_comment(line, how):
+            if not how.is_comment(line):
                 yield line
 
     blanks = how.delimiter == BLANKS
@@ -188,9 +185,7 @@ def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], w
             raise DataError(f"{where}: line {head.line} begins with {mark!r}. If it is a comment pass "
                             f"{call({'comment': mark} | needed)}.")
     if how.columns is not None:
-        names = [str(name).strip() for name in how.columns]
-        if len(names) != len(cells):
-            raise DataError(f"{where} has {len(cells)} columns, columns= names {len(names)}.")
+        names = [name.strip() for name in position_names(how.columns, len(cells), where)]
         if len(rows) > 1 and not any(map(_is_value, cells)) and not any(map(how.is_missing, cells)):
             raise DataError(f"{where} has a header ({', '.join(cells)[:60]}). Leave columns= out, or pass "
                             f"{call({'skip_rows': head.line} | needed)}.")
@@ -210,9 +205,7 @@ def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], w
         if len(cells) != width:
             _refuse_preamble(rows, width, where, needed)
         names = _fitted(cells, rows[1:])
-    for name, count in Counter(names).items():
-        if name and count > 1:
-            raise DataError(f"{where} has two columns named {name!r}: rename one.")
+    check_unique(filter(None, names), where)
     texts, units = _text_rows(rows[1:], names, how)
     if how.units_row and how.units_row < len(rows) and any(map(_is_value, rows[how.units_row].cells)):
         raise DataError(f"{where}: units_row={how.units_row}, but row {how.units_row} after the header holds numbers.")

@@ -3,19 +3,21 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from optid.data.reading.clock import is_rate_name
-from optid.data.reading.mat_tree import Node, Numbers, Refused
-from optid.data.reading.mat_variables import SIDES, Variable, is_scalar_clock, is_time_vector, list_variables
+from optid.data.reading.mat_tree import Node, Numbers, Refused, open_tree
+from optid.data.reading.mat_variables import SIDES, Variable, by_path, is_scalar_clock, is_time_vector, list_variables
 from optid.errors import DataError, nearest
 
 VECTOR, SCALAR, HIDDEN, NO_CLOCK = range(4)  # kinds of clocks, the best first; a hidden one cannot be read
+H5PY = 'pip install "optid[mat]"'
 STEP_TOLERANCE = 0.01  # largest relative difference of two sampling times in one structure
 
-Path = tuple[str, ...]
+FieldPath = tuple[str, ...]
 Found = list[Variable]  # variables of one path, one for each element of the arrays on it
 
 
@@ -49,18 +51,33 @@ def read_contents(tree: dict[str, Node], names: Sequence[str] | None) -> MatCont
     return record.list_names() if names is None else record.load(names)
 
 
+def file_contents(path: Path, names: Sequence[str] | None) -> MatContents:
+    """Return the variables of these names, by default only which there are; errors as of `mat_contents`.
+
+    This runs in the child process.
+    """
+    try:
+        with open_tree(path) as tree:
+            return read_contents(tree, names)
+    except DataError as error:
+        raise DataError(f"{path.name}: {error}") from None
+    except Exception as error:  # whatever a library raises on a damaged file
+        if isinstance(error, ImportError) and "h5py" in str(error):
+            raise DataError(f"{path.name} is a MAT file of version 7.3, which needs h5py: {H5PY}") from None
+        text = str(error) or type(error).__name__
+        raise DataError(f"{path.name} is damaged, or not a MAT file: {text}") from None
+
+
 class _Record:
     """Variables by name, and the structure among them that holds the record."""
 
     def __init__(self, variables: list[Variable]) -> None:
-        by_path: dict[Path, Found] = {}
-        for v in variables:
-            by_path.setdefault(v.path, []).append(v)
-        self.clocks: dict[Path, list[Found]] = {}  # clocks in each structure, the best first
-        for found in sorted(by_path.values(), key=_clock_rank):
+        groups = by_path(variables)
+        self.clocks: dict[FieldPath, list[Found]] = {}  # clocks in each structure, the best first
+        for found in sorted(groups.values(), key=_clock_rank):
             if _clock_rank(found) < NO_CLOCK:
                 self.clocks.setdefault(found[0].path[:-1], []).append(found)
-        shown = {path: found for path, found in by_path.items()
+        shown = {path: found for path, found in groups.items()
                  if _clock_rank(found) < NO_CLOCK or any(not isinstance(v.node, str) for v in found)}
         self.home = _find_home(shown)
         self.names = _short_names(shown, self.home) | {".".join(path): found for path, found in shown.items()}
@@ -153,13 +170,13 @@ class _Record:
         return ""
 
 
-def _find_home(shown: Mapping[Path, Found]) -> Path | None:
+def _find_home(shown: Mapping[FieldPath, Found]) -> FieldPath | None:
     """Return the structure that holds the record; None if several might.
 
     It is the only one with inputs u or u1, ... and outputs y or y1, ..., the top level before all others; if none has
     both, the only one with signals of the largest length.
     """
-    letters: dict[Path, set[str]] = {}
+    letters: dict[FieldPath, set[str]] = {}
     for path, found in shown.items():
         is_signal = any(v.size > 1 or isinstance(v.node, Refused) for v in found)
         if is_signal and re.fullmatch(r"[uy][0-9]*|InputData|OutputData", path[-1]):
@@ -172,7 +189,7 @@ def _find_home(shown: Mapping[Path, Found]) -> Path | None:
     return () if () in homes else homes[0] if len(homes) == 1 else None
 
 
-def _short_names(shown: Mapping[Path, Found], home: Path | None) -> dict[str, Found]:
+def _short_names(shown: Mapping[FieldPath, Found], home: FieldPath | None) -> dict[str, Found]:
     """Return the variables in the structure that holds the record; none where the top level has the same names."""
     if home is None:
         return {}

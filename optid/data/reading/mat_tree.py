@@ -144,13 +144,11 @@ def _times(shape: Iterable[int]) -> str:
 def _tree_of_scipy(path: Path) -> dict[str, Node]:
     from scipy.io import loadmat, matlab
 
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         # With mat_dtype a double that MATLAB packed into bytes comes back as a double, but without its imaginary part.
         content = loadmat(path, mat_dtype=True)
     lossy = any(issubclass(warning.category, np.exceptions.ComplexWarning) for warning in caught)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         stored = loadmat(path) if lossy else content
         limit = _Limit()
         tree = {name: _node_of_scipy(value, stored[name], 1, limit) for name, value in content.items()

@@ -1,6 +1,6 @@
 """The variables in the tree of a MAT file, with the forms that Simulink and the System Identification Toolbox save."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,7 +102,7 @@ def _scalar_elements(node: Elements, path: tuple[str, ...], name: str, index: tu
 
 def _structures_with_time(variables: list[Variable]) -> list[Variable]:
     """Name the signals of Simulink's "Structure with time" by their labels, a single one like the structure."""
-    groups = _by_path(variables)
+    groups = by_path(variables)
     for path in [path for path in groups if path[-2:] == ("signals", "values")]:
         group = path[:-2]
         values, labels = groups[path], {v.index: v.node for v in groups.get((*path[:-1], "label"), [])}
@@ -126,7 +126,7 @@ def _structures_with_time(variables: list[Variable]) -> list[Variable]:
 
 def _iddata(variables: list[Variable]) -> list[Variable]:
     """Name the channels of what `get(iddata)` gives, before the arrays that hold them."""
-    groups = _by_path(variables)
+    groups = by_path(variables)
     channels: list[Variable] = []
     units: dict[int, str] = {}
     for group in [path[:-1] for path in groups if path[-1] == "OutputData" and (*path[:-1], "InputData") in groups]:
@@ -154,7 +154,7 @@ def _iddata(variables: list[Variable]) -> list[Variable]:
 
 def _times_in_seconds(variables: list[Variable]) -> list[Variable]:
     """Convert times and sampling times to seconds where a `TimeUnit` is beside them."""
-    groups = _by_path(variables)
+    groups = by_path(variables)
 
     def convert(v: Variable) -> Variable:
         unit = next(iter(_texts(groups, (*v.path[:-1], "TimeUnit"))), "").lower() or "seconds"
@@ -162,7 +162,8 @@ def _times_in_seconds(variables: list[Variable]) -> list[Variable]:
             return v
         if unit not in SECONDS_PER_UNIT:
             return replace(v, node=Refused(f"is in {unit[:40]!r}; known TimeUnit: {', '.join(SECONDS_PER_UNIT)}"))
-        return replace(v, node=Numbers(v.node.shape, _times(v.node.load, SECONDS_PER_UNIT[unit])))
+        load = v.node.load
+        return replace(v, node=Numbers(v.node.shape, lambda: load() * SECONDS_PER_UNIT[unit]))
 
     return [convert(v) for v in variables]
 
@@ -202,11 +203,8 @@ def _column(node: Node, k: int) -> Numbers | Refused | str:
     return node if len(node.shape) == 1 else Numbers(node.shape[:1], lambda: load()[:, k])
 
 
-def _times(load: Callable[[], np.ndarray], factor: float) -> Callable[[], np.ndarray]:
-    return lambda: load() * factor
-
-
-def _by_path(variables: list[Variable]) -> dict[tuple[str, ...], list[Variable]]:
+def by_path(variables: list[Variable]) -> dict[tuple[str, ...], list[Variable]]:
+    """Return the variables of each path."""
     groups: dict[tuple[str, ...], list[Variable]] = {}
     for v in variables:
         groups.setdefault(v.path, []).append(v)

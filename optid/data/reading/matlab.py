@@ -1,7 +1,6 @@
 """MAT files of versions 4 to 7.3, read in a child process: a damaged file may crash the library or exhaust memory."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -9,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from optid.data.reading.clock import is_time_name
-from optid.data.reading.mat_contents import MatContents, read_contents
-from optid.data.reading.mat_tree import open_tree
+from optid.data.reading.format import Format
+from optid.data.reading.mat_contents import MatContents, file_contents
+from optid.data.reading.tables import RawTable
 from optid.errors import DataError
 from optid.processes import run_apart
 
-MAT = 'pip install "optid[mat]"'
 MEMORY, EXPANSION = 4 << 30, 32  # memory limit in bytes, or `EXPANSION` times the size of the file if that is more
 SECONDS, PACE = 60.0, 1 << 30  # time limit, and again for each `PACE` bytes
 
@@ -27,7 +26,7 @@ def mat_contents(path: Path, names: Sequence[str] | None = None) -> MatContents:
     """
     size, damaged = path.stat().st_size, f"{path.name} is damaged, or not a MAT file"
     try:
-        return run_apart(_variables, path, names, quiet=True, seconds=SECONDS * (1 + size / PACE),
+        return run_apart(file_contents, path, names, quiet=True, seconds=SECONDS * (1 + size / PACE),
                          memory=max(MEMORY, EXPANSION * size))
     except TimeoutError:
         raise DataError(f"{damaged}: reading it took more than {SECONDS:g} s.") from None
@@ -35,29 +34,24 @@ def mat_contents(path: Path, names: Sequence[str] | None = None) -> MatContents:
         raise DataError(f"{damaged}: the process that read it crashed ({death}).") from None
 
 
-@dataclass(frozen=True)
-class MatExperiment:
-    """One experiment of some signals."""
+def mat_table(path: Path, how: Format) -> RawTable:
+    """Return the table of a MAT file, to be split into experiments; errors as of `mat_contents`."""
+    listing = mat_contents(path)
+    names = list(listing.experiments[0])
+    if not set(names) - listing.refused.keys():
+        reasons = " ".join(f"{name!r} {reason}" for name, reason in list(listing.refused.items())[:3])
+        raise DataError(f"{path.name} holds no arrays of numbers. {reasons}".rstrip())
+    return RawTable(path.name, names, lambda wanted, _: mat_contents(path, wanted).experiments[0], how,
+                    split=partial(_experiments, path, listing, how), inputs=listing.inputs or None,
+                    outputs=listing.outputs or None)
 
-    label: str  # name of the file and number of the experiment, for messages
-    names: list[str]  # names that can be loaded
-    load: Callable[..., dict[str, Any]]  # function of names, returning {name: array}
-    index: str | None  # name of the time vector
-    step: float | None  # sampling time in seconds that a scalar beside the signals says
 
+def _experiments(path: Path, listing: MatContents, how: Format, signals: Sequence[str], time: Any) -> list[RawTable]:
+    """Return the table of each experiment of some signals, with the clock beside them.
 
-def split_experiments(path: Path, listing: MatContents, signals: Sequence[str], time: Any) -> list[MatExperiment]:
-    """Return the experiments of some signals, with the clock beside them.
-
-    Args:
-        path: the file.
-        listing: its contents without arrays.
-        signals: names of inputs and outputs.
-        time: as of `optid.data.readers.read`; None and True take the clock beside the signals.
-
-    Raises:
-        DataError: a signal or its clock cannot be read, or time is True and there is none; loading raises it also where
-            the clocks of the signals differ, or where an experiment lacks a signal that another one has.
+    `time` is as of `optid.data.readers.read`; None and True take the clock beside the signals. `DataError`: a signal or
+    its clock cannot be read, or time is True and there is none; loading raises it also where the clocks of the signals
+    differ, or where an experiment lacks a signal that another one has.
     """
     by_default = time is None or time is True
     clocks = [listing.clocks[name] for name in signals if name in listing.clocks] if by_default else []
@@ -96,24 +90,10 @@ def split_experiments(path: Path, listing: MatContents, signals: Sequence[str], 
         return {name: arrays[name] for name in wanted}
 
     names = [name for name in listing.experiments[0] if not by_default or name in signals or not is_time_name(name)]
-    return [MatExperiment(path.name if count == 1 else f"{path.name}, experiment {number + 1}", names,
-                          partial(load, number), vectors[0] if vectors else None, next(iter(steps.values()), None)
-                          ) for number in range(count)]
+    return [RawTable(path.name if count == 1 else f"{path.name}, experiment {number + 1}", names,
+                     partial(load, number), how, vectors[0] if vectors else None, units=listing.units,
+                     step=next(iter(steps.values()), None)) for number in range(count)]
 
 
 def _is_same(one: np.ndarray, other: np.ndarray) -> bool:
     return one.shape == other.shape and np.allclose(one, other, rtol=1e-9, equal_nan=True)
-
-
-def _variables(path: Path, names: Sequence[str] | None) -> MatContents:
-    """Return these variables; the child process runs this."""
-    try:
-        with open_tree(path) as tree:
-            return read_contents(tree, names)
-    except DataError as error:
-        raise DataError(f"{path.name}: {error}") from None
-    except Exception as error:  # whatever a library raises on a damaged file
-        if isinstance(error, ImportError) and "h5py" in str(error):
-            raise DataError(f"{path.name} is a MAT file of version 7.3, which needs h5py: {MAT}") from None
-        text = str(error) or type(error).__name__
-        raise DataError(f"{path.name} is damaged, or not a MAT file: {text}") from None

@@ -38,8 +38,7 @@ def plant_tables(path: Path, kind: str) -> list[PlantTable]:
     """
     read = {".xlsx": _of_excel, ".tdms": _of_tdms, ".mf4": _of_mdf}[kind]
     try:
-        with warnings.catch_warnings():  # about one another's versions
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):  # about one another's versions
             found = read(path)
     except ImportError:
         raise DataError(f"{path.name}: files of kind {kind} are read by {LIBRARIES[kind]}: {PLANT}") from None

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from optid.data.reading.clock import NoStamps, TimeColumn, over_midnight, recognise, seconds
-from optid.data.reading.sources import RawTable, Source
+from optid.data.reading.tables import RawTable, Source
 from optid.data.reading.uniform import COARSE, share_of_repeats
 from optid.errors import DataError
 
@@ -15,16 +15,9 @@ AGREEMENT = 1e-3  # share of the span by which two clocks may differ, beyond one
 
 def settle(block: Mapping[str, Any], names: Sequence[str], table: RawTable | Source, asked: bool
            ) -> tuple[TimeColumn, np.ndarray, list[str]]:
-    """Return the clock that some columns hold, its stamps (N,), and findings.
+    """Return the clock that some columns, the likeliest first, hold, its stamps (N,), and findings.
 
-    Args:
-        block: the columns.
-        names: columns named as a clock, the likeliest first.
-        table: their source.
-        asked: whether the user named them.
-
-    Raises:
-        DataError: the only column, or one that the user named, holds no stamps; or two clocks disagree.
+    `DataError`: the only column, or one that the user named (`asked`), holds no stamps; or two clocks disagree.
     """
     clocks: list[TimeColumn] = []
     refused: dict[str, NoStamps] = {}

@@ -10,7 +10,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.reading import dates
 from optid.data.reading.clock import TimeColumn, clock_columns, recognise, seconds
-from optid.data.reading.columns import choose, to_numbers
+from optid.data.reading.columns import check_unique, choose, to_numbers
 from optid.data.reading.format import Format, is_number
 from optid.errors import DataError
 
@@ -56,19 +56,10 @@ class RowReader:
 
     def __init__(self, inputs: Sequence[str], outputs: Sequence[str], *, dt: float, time: str | bool | None = None,
                  how: Format | None = None, fill: int = 0, label: str = "stream") -> None:
-        """Prepare for the columns of inputs and outputs with time stamps at the sampling time dt.
+        """Prepare for the columns of inputs and outputs, with time stamps every dt in the column `time`.
 
-        Args:
-            inputs: columns of the inputs.
-            outputs: columns of the outputs.
-            dt: sampling time of the time stamps.
-            time: column of time stamps; by default one that is named as a clock; False ignores it.
-            how: how the table is written.
-            fill: largest number of missing samples inserted into a gap of whole sampling times; 0 refuses gaps.
-            label: name of the table in messages.
-
-        Raises:
-            DataError: a word of the format that needs the whole record.
+        By default that is one that is named as a clock; False ignores it. At most `fill` missing samples are put into a
+        gap of whole sampling times; 0 refuses gaps. `DataError`: a word of the format needs the whole record.
         """
         how = Format() if how is None else how
         for word, instead in (("gaps", "fill_gaps"), ("resample", ""), ("quality", ""), ("from_", ""), ("to", "")):
@@ -85,9 +76,7 @@ class RowReader:
             self._known([str(name) for name in how.columns])
 
     def _known(self, names: list[str]) -> None:
-        for name in names:
-            if name and names.count(name) > 1:
-                raise DataError(f"{self._label} has two columns named {name!r}: rename one.")
+        check_unique(filter(None, names), self._label)
         ins, outs = (choose(names, wanted, letter, self._label) for wanted, letter in zip(self._wanted, "uy"))
         signals = [*ins.values(), *outs.values()]
         clocks = clock_columns(names, self._time, signals, self._label)
@@ -130,7 +119,7 @@ class RowReader:
         """Read complete lines, without their ends; `DataError` for a header without the required columns."""
         lines = list(lines)
         if self._names is None:
-            while lines and (not lines[0].strip() or self.line < self._how.skip_rows or self._is_comment(lines[0])):
+            while lines and (not lines[0].strip() or self.line < self._how.skip_rows or self._how.is_comment(lines[0])):
                 del lines[0]
                 self.line += 1
             if not lines:
@@ -157,9 +146,6 @@ class RowReader:
         if '"' in line:
             return next(csv.reader([line], delimiter=self._delimiter), [])
         return line.split(self._delimiter)
-
-    def _is_comment(self, line: str) -> bool:
-        return self._how.comment is not None and line.lstrip().startswith(self._how.comment)
 
     def _is_units(self, line: str) -> bool:
         """Whether a line after the header holds units: texts, and nothing missing or numeric."""
@@ -211,7 +197,7 @@ class RowReader:
             if not line.strip():
                 self._blank.append(number)
                 continue
-            if self._is_comment(line):
+            if self._how.is_comment(line):
                 continue
             for blank in self._blank:  # blank lines at the end are none
                 rows.append([np.nan] * len(self._places))

@@ -1,9 +1,9 @@
-"""Sources of records: named columns, loaded whole, or read in blocks and parts."""
+"""The tables and sources of files, frames, arrays and Dask collections."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,50 +18,11 @@ from optid.data.reading.format import Format
 from optid.data.reading.frames import dated_columns, frame_names, index_name, load_frame, partition_blocks
 from optid.data.reading.npyfile import npz_arrays, open_npy, side_by_side
 from optid.data.reading.parts import Part, file_parts
+from optid.data.reading.tables import RawTable, Source
 from optid.errors import DataError
 
 TEXT = (".csv", ".txt", ".tsv", ".lvm", ".dat", ".asc")
 PLANT = (".xlsx", ".tdms", ".mf4")
-
-
-@dataclass(frozen=True)
-class RawTable:
-    """A source whose columns can be loaded by name."""
-
-    label: str  # name of the source, for messages
-    names: list[str]  # names of its columns or variables
-    # function of columns, and of those among them that may be texts or dates, returning {name: array}: numeric columns
-    # are (N,) or (N, channels) of a real type, texts (N,) objects
-    load: Callable[[Sequence[str], Mapping[str, str]], dict[str, Any]]
-    how: Format = Format()  # how it is written: what the user said, completed by what the source says
-    index: str | None = None  # name of a time index besides the columns
-    dates: tuple[str, ...] = ()  # columns of dates
-    units: Mapping[str, str] = field(default_factory=dict)  # units by column, where the source has them
-    step: float | None = None  # sampling time that stands beside the samples
-    hints: Mapping[str, str] = field(default_factory=dict)  # why columns not named as a clock may be it
-    advice: str = ""  # what a refusal proposes to type
-    findings: tuple[str, ...] = ()
-    # function of the columns of inputs and outputs, and of `time` as of `optid.data.readers.read`, where they decide
-    # which experiments there are, and with which clock: returns a table for each
-    split: Callable[[Sequence[str], Any], "list[RawTable]"] | None = None
-    inputs: Mapping[str, str] | None = None  # {channel: column} of the inputs, where the source says it
-    outputs: Mapping[str, str] | None = None
-
-
-@dataclass(frozen=True)
-class Source:
-    """A source of one experiment that need not fit into memory."""
-
-    names: Sequence[str]  # names of its columns
-    n_samples: int | None  # number of samples, None if only a pass gives it
-    whole: Part | None  # all of it; None where it exists in parts only
-    # function of the columns to read, returning the independent parts in the order of time
-    parts: Callable[[Sequence[str]], Iterable[Part]]
-    label: str  # name of the source, for messages
-    how: Format = Format()  # how it is written
-    dates: tuple[str, ...] = ()  # columns of dates
-    units: Mapping[str, str] = field(default_factory=dict)  # units by column, where the source has them
-    findings: tuple[str, ...] = ()
 
 
 def existing(path: Path) -> Path:
@@ -106,7 +67,7 @@ def open_tables(source: Any, how: Format) -> list[RawTable]:
 
 def _file_tables(path: Path, kind: str, how: Format) -> list[RawTable]:
     if kind in TEXT:
-        file = open_csv(path, replace(how, delimiter="\t") if kind == ".tsv" and not how.delimiter else how)
+        file = open_csv(path, how)
         return [RawTable(path.name, file.names, file.columns, file.layout.how, None, file.layout.dates,
                          file.layout.units, advice=file.layout.advice, hints=file.layout.hints,
                          findings=file.layout.findings)]
@@ -130,24 +91,9 @@ def _file_tables(path: Path, kind: str, how: Format) -> list[RawTable]:
 
         return [replace(_of_frame(one.label, one.frame, how), units=one.units, findings=one.findings)
                 for one in plant_tables(path, kind)]
-    return [_of_mat(path, how)]
+    from optid.data.reading.matlab import mat_table
 
-
-def _of_mat(path: Path, how: Format) -> RawTable:
-    from optid.data.reading.matlab import mat_contents, split_experiments
-
-    contents = mat_contents(path)
-    names = list(contents.experiments[0])
-    if not set(names) - contents.refused.keys():
-        reasons = " ".join(f"{name!r} {reason}" for name, reason in list(contents.refused.items())[:3])
-        raise DataError(f"{path.name} holds no arrays of numbers. {reasons}".rstrip())
-
-    def split(signals: Sequence[str], time: Any) -> list[RawTable]:
-        return [RawTable(one.label, one.names, one.load, how, one.index, units=contents.units, step=one.step)
-                for one in split_experiments(path, contents, signals, time)]
-
-    return RawTable(path.name, names, lambda wanted, _: mat_contents(path, wanted).experiments[0], how, split=split,
-                    inputs=contents.inputs or None, outputs=contents.outputs or None)
+    return [mat_table(path, how)]
 
 
 def _of_frame(label: str, frame: Any, how: Format) -> RawTable:
@@ -248,7 +194,7 @@ def open_source(source: Any, chunk: int, how: Format) -> Source:
         whole = Part(path.name, partial(parquet_blocks, path, None, chunk), rows)
         return Source(names, rows, whole, lambda _: parquet_parts(path, chunk), path.name, how, dates)
     if kind in TEXT:
-        file = open_csv(path, replace(how, delimiter="\t") if kind == ".tsv" and not how.delimiter else how)
+        file = open_csv(path, how)
         found = _of_files(file.names, how, Part(path.name, partial(file.blocks, chunk)), path)
         return replace(found, how=file.layout.how, dates=file.layout.dates, units=file.layout.units,
                        findings=file.layout.findings)

@@ -28,18 +28,11 @@ class Piece:
 
 def uniform_step(stamps: np.ndarray, tolerance: float, label: str, step: float | None = None, first: int = 0
                  ) -> float | None:
-    """Check that time stamps are uniform and return the sampling time, None for a single stamp.
+    """Check that time stamps (N,) are uniform and return the sampling time, None for a single stamp.
 
-    Args:
-        stamps: (N,), dates, durations or seconds.
-        tolerance: largest deviation of a step from the median step, relative to it.
-        label: name of the source, for the message.
-        step: what the steps are compared with; their median when not given.
-        first: index of the first stamp in the whole record.
-
-    Raises:
-        DataError: a stamp is missing, time does not increase, or a step deviates; the message has the sample, the
-            step found there, the median step, the likely reason and what to type.
+    No step may deviate by more than the relative tolerance from `step`, by default the median; `first` is the index of
+    the first stamp in the whole record. `DataError`: a stamp is missing, time does not increase, or a step deviates;
+    the message has the sample, the step found there, the median step, the likely reason and what to type.
     """
     _check_whole(stamps, label, first)
     if stamps.size < 2:
@@ -96,16 +89,8 @@ def regular(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, dt: float | None, 
             ) -> tuple[list[Piece], float | None, list[str]]:
     """Return uniform pieces of a record, their sampling time, and what was done.
 
-    Args:
-        stamps: (N,) stamps.
-        u: (N, m) inputs.
-        y: (N, l) outputs.
-        dt: sampling time that the user gave.
-        how: format, with the repairs asked for.
-        label: name of the source, for messages.
-
-    Raises:
-        DataError: stamps that are not uniform, where no repair was asked for or none helps.
+    The record is stamps (N,), u (N, m), y (N, l); `dt` is what the user gave, `how` has the repairs asked for.
+    `DataError`: stamps that are not uniform, where no repair was asked for or none helps.
     """
     _check_whole(stamps, label, 0)
     if how.resample is not None:
@@ -137,11 +122,16 @@ def share_of_repeats(stamps: np.ndarray) -> float:
 
 def _are_copies(stamps: np.ndarray, u: np.ndarray, y: np.ndarray) -> bool:
     """Whether all rows with the stamp of the row before are equal to it, on a record that is not constant."""
-    same = stamps[1:] == stamps[:-1]
-    equal = np.ones(same.size, dtype=bool)
-    for column in (*u.T, *y.T):
-        equal &= (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
+    same, equal = stamps[1:] == stamps[:-1], _equal_the_row_before(u) & _equal_the_row_before(y)
     return bool(equal[same].all()) and not equal[~same].all()
+
+
+def _equal_the_row_before(samples: np.ndarray) -> np.ndarray:
+    """Return which rows (N-1,), from the second on, equal the one before; missing samples equal each other."""
+    equal = np.ones(len(samples) - 1, dtype=bool)
+    for column in samples.T:
+        equal &= (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
+    return equal
 
 
 def _check_whole(stamps: np.ndarray, label: str, first: int) -> None:
@@ -269,13 +259,10 @@ def _without_gaps(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, how: Format,
     samples = np.hstack([u, y])
     findings = []
     if twice := stamps.size - once.size:
-        same = np.array_equal(samples[1:][multiples == 0], samples[:-1][multiples == 0], equal_nan=True)
+        other = (multiples == 0) & ~_equal_the_row_before(samples)
         findings.append(f"{twice} row{'s' if twice > 1 else ''} with the stamp of the row before: "
-                        + ("counted once" if same else "where the values differ the samples are missing"))
-        if not same:
-            samples = samples.copy()
-            other = ~np.all((samples[1:] == samples[:-1]) | (np.isnan(samples[1:]) & np.isnan(samples[:-1])), axis=1)
-            samples[rows[np.searchsorted(once, positions[1:][(multiples == 0) & other])]] = np.nan
+                        + ("where the values differ the samples are missing" if other.any() else "counted once"))
+        samples[rows[np.searchsorted(once, positions[1:][other])]] = np.nan
     samples, m = samples[rows], u.shape[1]
     if how.gaps == "experiments":
         cuts = np.flatnonzero(np.diff(once) > 1) + 1

@@ -21,8 +21,8 @@ from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.identify.arguments import Offset, check_offset, per_channel
-from optid.identify.gauges import Gauge, in_gauge
 from optid.models import HammersteinTF, Nonlinearity
+from optid.models.gauges import Gauge, in_gauge
 from optid.program.compressed import Spread, white_spread
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.statistics import ExperimentMeans, Layout, Statistics, accumulate, collect, collect_by_experiment

@@ -95,8 +95,7 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
     states = state_criteria(whole, expansion, alpha, max(largest, 1), *parts)
     lags = None
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
+        with warnings.catch_warnings(action="ignore", category=DataWarning):
             lags = scan_lags(data if train is None else train, expansion.inputs, na=na, nb=nb, nk=nk, test=test)
     except RankError as error:
         notes.append(f"No scan of lags. {error}")

@@ -17,7 +17,7 @@ from optid.data.record import Data
 from optid.errors import OptidError, RankError
 from optid.identify.blocks import Blocks
 from optid.identify.informativity import Informativity, Process, informativity
-from optid.identify.lag_sums import LagSums, linear, scan
+from optid.identify.lag_sums import LagSums, scan
 from optid.identify.levels import LevelEvidence, level_evidence
 from optid.identify.process.order import best_basis, choose_types
 from optid.identify.process.record import process_errors
@@ -41,27 +41,16 @@ FINEST = 0.01  # share of the error (100 % less the cross-validated fit) that co
 
 @dataclass
 class Ladder:
-    """The record, its delays, and all trials so far.
-
-    Attributes:
-        data: the record.
-        folds: fits of a trial after the first.
-        told: what it can tell.
-        delays: combinations of delays of the inputs: none, and those found.
-        regressions: orders (na, nb, nk) of the best autoregressions.
-        levels: the evidence for levels of the experiments; None for one experiment.
-        trials: all trials so far, by key.
-        spent: units of effort so far, by class.
-    """
+    """The record, its delays, and all trials so far."""
 
     data: Data
-    folds: int
-    told: Informativity
-    delays: list[tuple[int, ...]]
-    regressions: list[tuple[int, int, tuple[int, ...]]]
-    trials: dict[Any, Trial]
-    levels: LevelEvidence | None = None
-    spent: dict[str, float] = field(default_factory=lambda: dict.fromkeys(KINDS, 0.0))
+    folds: int  # fits of a trial after the first
+    told: Informativity  # what it can tell
+    delays: list[tuple[int, ...]]  # combinations of delays of the inputs: none, and those found
+    regressions: list[tuple[int, int, tuple[int, ...]]]  # orders (na, nb, nk) of the best autoregressions
+    trials: dict[Any, Trial]  # all trials so far, by key
+    levels: LevelEvidence | None = None  # the evidence for levels of the experiments; None for one experiment
+    spent: dict[str, float] = field(default_factory=lambda: dict.fromkeys(KINDS, 0.0))  # units of effort, by class
 
     @classmethod
     def of(cls, blocks: Blocks, several: bool = False) -> "Ladder":
@@ -69,14 +58,16 @@ class Ladder:
         data, told = blocks.data, informativity(blocks.data)
         if not data.is_regular:  # no lags can be compared
             return cls(data, len(blocks.moving), told, [], [], {})
-        sums = LagSums(blocks, linear(data))
+        sums = LagSums(blocks)
         delays = [(told.least,) * data.m]
         if told.processes:
             delays = list(dict.fromkeys([*delays, told.lags]))
-        best = [one for delay in delays for one in scan(sums, [delay])[:1]]
-        regressions = [(one.na, one.nb, one.nk) for one in best]
-        return cls(data, len(blocks.moving), told, delays, regressions, {},
-                   _levels_of(data, delays[-1]) if several else None)
+        regressions = [one[1:] for delay in delays for one in scan(sums, [delay])[:1]]
+        levels = None
+        if several:
+            with suppress(OptidError):  # too short for a regression: one level then
+                levels = level_evidence(data, list(delays[-1]))
+        return cls(data, len(blocks.moving), told, delays, regressions, {}, levels)
 
     def with_levels(self, candidate: StructureCandidate) -> StructureCandidate:
         """Return a candidate with a level for every experiment, where the record has them and the method knows them."""
@@ -104,11 +95,6 @@ class Ladder:
         """Whether the outputs do not act on the inputs."""
         return self.told.loop.word == "open"
 
-    @property
-    def single(self) -> bool:
-        """Whether there is one output."""
-        return self.data.l == 1
-
     def best(self, kind: str, *formulations: str) -> Trial | None:
         """Return the best complete trial of a class, or of some formulations of it."""
         found = [t for t in self.trials.values() if t.candidate.kind == kind and np.isfinite(t.score)
@@ -135,10 +121,6 @@ class Ladder:
         found = [t for t in self.trials.values() if t.candidate.kind == kind and np.isfinite(t.estimation)
                  and (not formulations or t.candidate.formulation in formulations)]
         return self.best(kind, *formulations) or max(found, key=lambda t: t.estimation, default=None)
-
-    def promising(self, kind: str, *formulations: str) -> bool:
-        """Whether a structure of a class, or of formulations of it, came through cross-validation."""
-        return self.best(kind, *formulations) is not None
 
     def follows(self, kind: str, *formulations: str) -> bool:
         """Whether a structure of a class follows the record by much better than the choice does, or is the choice."""
@@ -180,7 +162,7 @@ def linear_models(ladder: Ladder) -> Rung:
     if not ladder.data.is_regular:
         yield [processes_by_criterion(ladder, LINEAR)]
         return
-    if ladder.single and ladder.told.processes:
+    if ladder.data.l == 1 and ladder.told.processes:
         if ladder.few_moves and ladder.open:
             found = yield list(process_models(ladder))
             if any(trial.complete for trial in found):  # a finer dead time than a sample, in the terms of the plant
@@ -193,7 +175,7 @@ def linear_models(ladder: Ladder) -> Rung:
         yield from _in_a_loop(ladder)
         return
     yield from climb([model("hammerstein_ss.sid", nx=n, basis="linear")] for n in range(1, LARGEST + 1))
-    if not ladder.single:
+    if ladder.data.l > 1:
         n = int(ladder.arguments(LINEAR, "hammerstein_ss.sid").get("nx", 2))
         yield [model("ss.exact", nx=k) for k in dict.fromkeys([n, 2])]
         yield from climb([model("ss.exact", nx=k)] for k in range(n + 1, min(n + 3, LARGEST) + 1))
@@ -262,7 +244,7 @@ def _orders(process: Process) -> dict[str, Any]:
 def _in_a_loop(ladder: Ladder) -> Rung:
     """Yield models with a noise model, whose inputs act one sample later at the earliest."""
     model = partial(structure, LINEAR)
-    if ladder.single:
+    if ladder.data.l == 1:
         delay = list(ladder.delays[-1])
         yield from climb([model("bj.exact", na=n, nb=n, nk=delay, nc=1, nd=1),
                           model("armax.exact", na=n, nb=n, nk=delay, nc=n)] for n in range(1, 5))
@@ -279,7 +261,7 @@ def input_functions(ladder: Ladder) -> Rung:
         with suppress(RankError):  # too few samples for functions of the inputs: straight lines are left
             yield [processes_by_criterion(ladder, INPUTS, [*words, *more])]
         return
-    if not ladder.single:
+    if ladder.data.l > 1:
         yield from _of_several_outputs(ladder, words)
         return
     if not ladder.open:
@@ -297,7 +279,7 @@ def input_functions(ladder: Ladder) -> Rung:
     yield [model(k, nk, word) for k in dict.fromkeys([min(int(a["na"]), 3), 2]) for nk in delays for word in words]
     if not (a := ladder.arguments(INPUTS)):
         return
-    if ladder.promising(INPUTS):
+    if ladder.best(INPUTS):
         yield from climb([model(k, a["nk"], a["basis"])] for k in range(a["na"] + 1, 7))
     a = ladder.arguments(INPUTS)
     yield [model(a["na"], a["nk"], ladder.bases(word))
@@ -335,7 +317,7 @@ def feedback(ladder: Ladder) -> Rung:
     yield [model(nx=a["nx"], basis=a["basis"], feedback_basis=word)
            for word in ("polynomial:2", "polynomial:4", "triangular:6")]
     a = ladder.arguments(FEEDBACK)
-    if ladder.promising(FEEDBACK):
+    if ladder.best(FEEDBACK):
         yield from climb([model(nx=n, basis=a["basis"], feedback_basis=a["feedback_basis"])]
                          for n in range(a["nx"] + 1, 7))
 
@@ -381,7 +363,7 @@ def latent_signals(ladder: Ladder) -> Rung:
     yield [*(model(nx, channels, other, direct) for other in (SMOOTH, "polynomial:5", "bspline:4")),
            model(nx, channels, word, not direct),
            *(model(nx, channels, word, direct, basis) for basis in inner[1:])]
-    if ladder.promising(LATENT, "lfr.exact"):
+    if ladder.best(LATENT, "lfr.exact"):
         yield [structure(LATENT, "lfr.exact", **ladder.arguments(LATENT, "lfr.exact"), tries=2)]
 
 
@@ -413,7 +395,7 @@ def _output_functions(ladder: Ladder) -> Rung:
             a = ladder.arguments(LATENT, leading.candidate.formulation)
             inner = [ladder.bases(word) for word in (FLEXIBLE, "triangular:10", "polynomial:5")] if "basis" in a else []
             yield [model(**{**a, "basis": word}) for word in inner if word != a["basis"]]
-        if ladder.promising(LATENT, *words):
+        if ladder.best(LATENT, *words):
             a = ladder.arguments(LATENT, leading.candidate.formulation)
             yield from climb([model(**{**a, "nx": n})] for n in range(a["nx"] + 1, MOST_LATENT + 1))
 
@@ -425,10 +407,3 @@ RUNGS: dict[str, Callable[[Ladder], Rung]] = {
 def structure(kind: str, formulation: str, **arguments: Any) -> StructureCandidate:
     """Return a candidate of a class."""
     return StructureCandidate(kind, formulation, arguments)
-
-
-def _levels_of(data: Data, nk: tuple[int, ...]) -> LevelEvidence | None:
-    try:
-        return level_evidence(data, nk=list(nk))
-    except OptidError:  # too short for a regression: one level then
-        return None

@@ -242,7 +242,7 @@ def _climb(ladder: Ladder, kinds: Sequence[str], run: Runs, most: float, left: C
     share of the effort; then the class that has had the least for its kind. Of a batch, as much is tried at a time as
     costs a small share of the effort, so that no class waits for expensive structures of another.
     """
-    early = [kind for kind in (LINEAR, INPUTS) if kind in kinds and ladder.told.processes and ladder.single]
+    early = [kind for kind in (LINEAR, INPUTS) if kind in kinds and ladder.told.processes and ladder.data.l == 1]
     rungs = {kind: RUNGS[kind](ladder) for kind in kinds}
     batches: dict[str, list[StructureCandidate]] = {}
     waiting: dict[str, list[StructureCandidate]] = {}  # of the batch of a class, those that are not tried yet

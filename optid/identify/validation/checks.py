@@ -208,8 +208,7 @@ def tested_residuals(model: Any, data: Data, predicted: Sequence[Array], lags: i
 
 def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> tuple[Array, ...]:
     try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", DataWarning)
+        with warnings.catch_warnings(record=True, action="always", category=DataWarning) as caught:
             outputs = tuple(simulate_outputs(model, data, word, x0))
     except DataError as error:
         notes.append(f"No simulation. {error}" if word == SIMULATION else f"No simulation with {word}. {error}")
@@ -249,8 +248,7 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
                   "the noise")
     if not reason:
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DataWarning)
+            with warnings.catch_warnings(action="ignore", category=DataWarning):
                 found = structure_test(data, runs, known.processes)
         except RankError as error:
             reason = str(error)
@@ -321,8 +319,7 @@ def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizo
     if not named:
         raise StructureError("there is no model to compare")
     raw = data.raw()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # the notes of the validations contain them
+    with warnings.catch_warnings(action="ignore", category=DataWarning):  # the notes of the validations contain them
         validations = tuple(validate(model, raw, x0=x0, horizon=horizon) for model in named.values())
         curves = tuple(fit_by_horizon(model, raw) for model in named.values())
     nothing = tuple(np.full(e.y.shape, np.nan) for e in raw.experiments)

@@ -48,17 +48,11 @@ class FTest:
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """The rows of a regression, one array per experiment.
+    """The rows of a regression, one array per experiment."""
 
-    Attributes:
-        present: rows that count, (N,).
-        nuisance: columns (N, q) that are projected out of every experiment by itself.
-        noise: polynomial [1, a1, ...] that whitens the errors.
-    """
-
-    present: tuple[NDArray[np.bool_], ...]
-    nuisance: tuple[Array, ...]
-    noise: Array
+    present: tuple[NDArray[np.bool_], ...]  # rows that count, (N,)
+    nuisance: tuple[Array, ...]  # columns (N, q) that are projected out of every experiment by itself
+    noise: Array  # polynomial [1, a1, ...] that whitens the errors
 
     @cached_property
     def _parts(self) -> list[tuple[NDArray[np.bool_], Array]]:
@@ -107,12 +101,9 @@ def solve(columns: Array, target: Array, dependent: float = DEPENDENT) -> Array:
 def score_test(error: Array, tangent: Array, columns: Array, spare: int, negligible: float) -> FTest | None:
     """Test whether columns reduce the error beside the tangent space of the hypothesis; None if they add nothing to it.
 
-    Args:
-        error: (R,) what the hypothesis leaves.
-        tangent: (R, n) orthonormal basis of the directions in which the hypothesis can still move.
-        columns: (R, k) of the alternative.
-        spare: rows less what was projected out of them.
-        negligible: see `FTest.of`.
+    The error (R,) is what the hypothesis leaves, the tangent (R, n) an orthonormal basis of the directions in which it
+    can still move, the columns (R, k) those of the alternative; `spare` counts the rows less what was projected out of
+    them.
     """
     error = error - tangent @ (tangent.T @ error)
     sizes = np.linalg.norm(columns, axis=0)

@@ -29,18 +29,13 @@ Poles = NDArray[np.complex128]
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Functions of one input: powers of the standardised input, and a hat for each inner node.
-
-    Attributes:
-        nodes: (k + 2,) quantiles, or all levels where they are few: the family then contains every function.
-        coarse: (size, p) combinations of them that are fewer powers and hats.
-    """
+    """Functions of one input: powers of the standardised input, and a hat for each inner node."""
 
     centre: float
     spread: float
     degree: int
-    nodes: Array
-    coarse: Array
+    nodes: Array  # (k + 2,) quantiles, or all levels where they are few: the family then contains every function
+    coarse: Array  # (size, p) combinations of them that are fewer powers and hats
 
     @classmethod
     def of(cls, data: Data, c: int) -> "Family":
@@ -76,29 +71,18 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """One output, and the functions of all inputs through the filters of its process.
-
-    Attributes:
-        data: the record.
-        inputs: (N, m) per experiment, complete.
-        output: (N,) per experiment, centred and over its spread, zero where missing.
-        centre, spread: of the output.
-        families: functions by input.
-        poles, lags: of the filters, by input.
-        banks: by input, filters of its functions, (N, J, P) per experiment.
-        regression: rows that count, level and decays.
-    """
+    """One output, and the functions of all inputs through the filters of its process."""
 
     data: Data
-    inputs: list[Array]
-    output: Sequence[Array]
-    centre: float
+    inputs: list[Array]  # (N, m) per experiment, complete
+    output: Sequence[Array]  # (N,) per experiment, centred and over its spread, zero where missing
+    centre: float  # of the output, like the spread
     spread: float
-    families: tuple[Family, ...]
-    poles: tuple[Poles, ...]
+    families: tuple[Family, ...]  # functions by input
+    poles: tuple[Poles, ...]  # of the filters, by input
     lags: tuple[int, ...]
-    banks: list[list[Array]]
-    regression: Regression
+    banks: list[list[Array]]  # by input, filters of its functions, (N, J, P) per experiment
+    regression: Regression  # rows that count, level and decays
 
     @classmethod
     def of(cls, data: Data, o: int, process: Process) -> "Design":

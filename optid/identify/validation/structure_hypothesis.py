@@ -33,25 +33,15 @@ ROUNDING = 1e-12  # standard deviation of residuals, over the largest output, th
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What a hypothesis says of an output, and what it leaves.
+    """What a hypothesis says of an output, and what it leaves."""
 
-    Attributes:
-        design: functions and filters.
-        regression: whitens what is left.
-        predicted: (N,) per experiment, with level and decay.
-        directions: (N, n) per experiment, in which the hypothesis can move.
-        carriers: signals whose products are tested, (N, q) per experiment; none of a given model.
-        ratios: second over first singular value of filters times functions, by input.
-        rounding: whether nothing but rounding, and what the filters cut off, is left.
-    """
-
-    design: Design
-    regression: Regression
-    predicted: Sequence[Array]
-    directions: Sequence[Array]
-    carriers: list[Array]
-    ratios: list[float]
-    rounding: bool
+    design: Design  # functions and filters
+    regression: Regression  # whitens what is left
+    predicted: Sequence[Array]  # (N,) per experiment, with level and decay
+    directions: Sequence[Array]  # (N, n) per experiment, in which the hypothesis can move
+    carriers: list[Array]  # signals whose products are tested, (N, q) per experiment; none of a given model
+    ratios: list[float]  # second over first singular value of filters times functions, by input
+    rounding: bool  # whether nothing but rounding, and what the filters cut off, is left
 
     @property
     def error(self) -> Array:

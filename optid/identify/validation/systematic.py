@@ -25,17 +25,11 @@ ROWS = 8  # samples per column, at least
 
 @dataclass(frozen=True)
 class Systematic:
-    """The error of the response to the inputs, the largest over the outputs.
+    """The error of the response to the inputs, the largest over the outputs."""
 
-    Attributes:
-        share: its spread over that of the simulated output.
-        p_value: of none.
-        output: where it is.
-    """
-
-    share: float
-    p_value: float
-    output: str
+    share: float  # its spread over that of the simulated output
+    p_value: float  # of none
+    output: str  # where it is
 
     @property
     def found(self) -> bool:
