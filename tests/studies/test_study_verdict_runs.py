@@ -225,15 +225,12 @@ def test_what_is_no_table_of_runs_is_refused(given_rows, message):
         conclude(given_rows)
 
 
-def test_a_comparison_of_no_rows_is_refused():
-    with pytest.raises(DataError, match="no rows to compare"):
-        compare([])
-
-
 @pytest.mark.parametrize("nothing", [[], {}])
 def test_no_rows_at_all_say_so(nothing):
     verdict = conclude(nothing)
     assert verdict.headline.word == "Nothing to compare" and not verdict.recommended and not verdict.statements
+    with pytest.raises(DataError, match="no rows to compare"):
+        compare([])
 
 
 def test_data_on_which_every_run_ends_with_an_error_are_named():
