@@ -161,8 +161,8 @@ def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit
     fitted = fit(data, cell.formulation_name, solver=cell.solver_name, accuracy=cell.accuracy, time_limit=limit,
                  isolate=False, constraints=cell.constraints, solver_options=dict(cell.solver_options), raises=False,
                  **cell.options)
-    row = _verdict(fitted) | {"n_samples": data.n_samples + held, "n_estimation": data.n_samples, "n_inputs": data.m,
-                              "n_outputs": data.l}
+    row: dict[str, Any] = {"n_samples": data.n_samples + held, "n_estimation": data.n_samples, "n_inputs": data.m,
+                           "n_outputs": data.l, **_verdict(fitted)}
     remarks = [row["reason"]]
     if fitted.model is not None:
         row |= _figures(fitted.model, record, remarks)

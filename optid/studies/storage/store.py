@@ -121,15 +121,9 @@ class Store:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        with self._named("written"):
+        with self._named("written"), self._connection:  # which commits, or rolls back
             self._connection.execute("BEGIN IMMEDIATE")
-            try:
-                yield
-                self._connection.execute("COMMIT")
-            except BaseException:
-                if self._connection.in_transaction:
-                    self._connection.execute("ROLLBACK")
-                raise
+            yield
 
     def _all(self, statement: str, values: Mapping[str, Any] | Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         with self._named("read"):

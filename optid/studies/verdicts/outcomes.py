@@ -210,10 +210,8 @@ def _row_states(table: Table, accuracy: float, time: str) -> np.ndarray:
         (warm_failed, WARM_FAILED),
         (~np.isfinite(seconds_of(table, time)), UNTIMED),
     ]
-    states = np.full(len(status), SOLVED, dtype=object)
-    for condition, word in reversed(choices):
-        states = np.where(condition, word, states)
-    return states.astype(object)
+    conditions, words = zip(*choices)
+    return np.select(conditions, words, SOLVED).astype(object)
 
 
 def _against_the_best(found: Results) -> Results:

@@ -7,7 +7,8 @@ from typing import TypeVar
 from optid.phrases import plural
 from optid.program.solution import tolerance
 
-Key, Member = TypeVar("Key"), TypeVar("Member")
+Key = TypeVar("Key")
+Member = TypeVar("Member")
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
 FINEST = tolerance(0.0) / 100  # requested accuracies below are judged as this one
