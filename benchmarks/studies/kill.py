@@ -27,7 +27,7 @@ import psutil
 
 from optid.studies.execution.machine import machine
 from optid.studies.grid import cells
-from optid.studies.storage.store import finished_rows, read_rows
+from optid.studies.storage.store import read_rows
 from optid.studies.study import Study
 
 STUDY = """
@@ -61,10 +61,10 @@ def moments(db: Path) -> dict[tuple[str, int], np.datetime64]:
 
 def until_new_rows(process: subprocess.Popen, db: Path, number: int, limit: float = 300.0) -> None:
     """Wait until the process has written so many rows more."""
-    before = len(finished_rows(db))
+    before = len(moments(db))
     until = time.monotonic() + limit
     while process.poll() is None and time.monotonic() < until:
-        if len(finished_rows(db)) - before >= number:
+        if len(moments(db)) - before >= number:
             return
         time.sleep(0.02)
 

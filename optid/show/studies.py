@@ -57,7 +57,6 @@ def study_document(verdict: StudyVerdict, *, title: str = "", command: str = "")
         Section("figures", "Performance profiles", lambda: [Charts([profile_chart(section) for section in (
             verdict.overall, *(verdict.sections if several else ()))])], page_only=True),
         Section("models", "Models", lambda: [model_table(verdict.models)]),
-        Section("steps", "Steps", lambda: [steps_table(verdict)]),
         Section("failures", "Failures", lambda: _failures(verdict)),
         Section("method", "Method", lambda: [
             [*COUNTED, ("Time", f"{' + '.join(TIMES[found.measure])}: {TIME_WORDS[found.measure]}; median of the "
@@ -68,8 +67,7 @@ def study_document(verdict: StudyVerdict, *, title: str = "", command: str = "")
             Code(command or "optid study report STUDY.sqlite -o study.html"),
             [*page.versions(), *_machines(verdict)]], page_only=True)]
     left_out = {"formulations": not several, "figures": not verdict.overall.standings, "failures": not reasons,
-                "solvers": not verdict.overall.standings, "models": not any(verdict.models.solved.values()),
-                "steps": not verdict.steps}
+                "solvers": not verdict.overall.standings, "models": not any(verdict.models.solved.values())}
     lead = " · ".join([plural(len(found.data), "problem"), plural(len(found.solvers), "solver"),
                        plural(len(verdict.sections), "formulation")])
     return Document(title or " · ".join(studies[:3]) or "Study", lead,
@@ -106,8 +104,8 @@ def solver_table(section: StandingsSection) -> Table:
 
 def _interval(pair: Paired) -> str:
     """Write a paired comparison for a cell of a table: "1.5 (1.2 to 1.9)"."""
-    digits = ".3g" if pair.ratio else ".2f"
-    return f"{pair.value:{digits}} ({pair.low:{digits}} to {pair.high:{digits}})" if pair.n > 1 else "-"
+    value, low, high = pair.texts
+    return f"{value} ({low} to {high})" if pair.n > 1 else "-"
 
 
 def _formulations(verdict: StudyVerdict) -> list[Any]:
@@ -123,10 +121,10 @@ def _formulations(verdict: StudyVerdict) -> list[Any]:
 
 def profile_chart(section: StandingsSection) -> Chart:
     """Return the performance profile of every solver of a section: a step function."""
-    series, most = [], max((p.factors[-1] for p in section.profiles.values() if p.factors.size), default=1.0)
-    for k, (name, profile) in enumerate(section.profiles.items()):
-        xs = np.repeat([1.0, *profile.factors, 1.1 * most], 2)[1:]
-        ys = np.repeat([0.0, *profile.shares], 2)
+    series, most = [], max((factors.max(initial=1.0) for factors, _ in section.profiles.values()), default=1.0)
+    for k, (name, (factors, shares)) in enumerate(section.profiles.items()):
+        xs = np.repeat([1.0, *factors, 1.1 * most], 2)[1:]
+        ys = np.repeat([0.0, *shares], 2)
         series.append(Series(name, xs[: ys.size], ys[: xs.size], "line-only", COLOURS[k % len(COLOURS)],
                              dash="" if k < len(COLOURS) else "6 3", width=2.0))
     caption = "Share of the problems solved within a factor of the fastest time."
@@ -153,14 +151,6 @@ def _figures(some: DataSet, name: str) -> tuple[str, ...]:
     behind = "0" if name == some.choice.first else _interval(pair) if pair is not None else "-"
     return (f"{some.solved[name]:,} of {some.records:,}", *(number(v, 4 if k < 2 else 3) for k, v in enumerate(values)),
             behind)
-
-
-def steps_table(verdict: StudyVerdict) -> Table:
-    """Return accuracy and time of every solver on every step of the formulations with several steps."""
-    rows = [(short(one.formulation, 30), one.step, one.solver, f"{one.reached:,} of {one.programs:,}",
-             seconds(one.time), number(one.iterations, 3)) for one in verdict.steps]
-    note = "Programmes that reached their accuracy; time and iterations of the step in a run, on average."
-    return Table("", ("formulation", "step", "solver", "solved", "time", "iterations"), rows, note)
 
 
 def _failures(verdict: StudyVerdict) -> list[Any]:

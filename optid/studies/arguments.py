@@ -3,19 +3,20 @@
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from itertools import product
 from math import prod
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
 from optid.bases import parse
 from optid.errors import OptidError, nearest
+from optid.studies.messages import Problem
 
 MOST = 10_000
 """Formulations of one grid."""
-
-Problem = tuple[tuple[str | int, ...], str]
-"""Keys that lead to a value, and what is wrong with it."""
 
 
 def arguments(function: Callable[..., Any]) -> dict[str, inspect.Parameter] | None:
@@ -52,18 +53,20 @@ def argument_problems(name: str, function: Callable[..., Any], options: Mapping[
         yield (), f"formulation {name!r} needs {', '.join(missing)}"
 
 
+@cache
+def _adapter(annotation: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(annotation, config=ConfigDict(strict=True, arbitrary_types_allowed=True))
+
+
 def accepts(annotation: Any, value: Any) -> bool:
     """Whether a value is of an annotated type; what cannot be decided here is left to the formulation."""
-    members = get_args(annotation)
-    if get_origin(annotation) in (Union, UnionType):
-        return any(accepts(member, value) for member in members)
-    if _is_list(annotation):
-        return isinstance(value, list | tuple) and all(accepts(members[0], one) for one in value if members)
-    if annotation is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    if annotation is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    return not isinstance(annotation, type) or annotation is inspect.Parameter.empty or isinstance(value, annotation)
+    if isinstance(annotation, str) or annotation is inspect.Parameter.empty:
+        return True
+    try:
+        _adapter(annotation).validate_python(value)
+    except ValidationError:
+        return False
+    return True
 
 
 def points(function: Callable[..., Any], raw: Mapping[str, Any], one_input: bool) -> list[dict[str, Any]]:
@@ -103,5 +106,6 @@ def _spoken(annotation: Any) -> str:
     words = {"int": "an integer", "float": "a number", "str": "a text", "bool": "true or false", "None": "left out"}
     text = re.sub(r"[\w.]*\.", "", annotation.__name__ if isinstance(annotation, type) else str(annotation))
     plural = {"int": "integers", "float": "numbers", "str": "texts", "bool": "true and false"}
+    text = re.sub(r"Literal\[(.*)\]", r"one of \1", text)
     text = re.sub(r"Sequence\[(.*)\]", lambda m: "a list of " + plural.get(m[1], m[1]), text)
     return " or ".join(words.get(word, word) for word in text.split(" | "))

@@ -20,15 +20,15 @@ from pydantic import (
     model_validator,
 )
 from pydantic.dataclasses import dataclass
-from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from optid.backends.choice import back_ends
 from optid.data.readers import Format
 from optid.data.record import Data
 from optid.errors import DataError, StudyError, nearest
-from optid.registry import CONSTRAINTS, FORMULATIONS, find_entry_points, named_constraint
+from optid.registry import FORMULATIONS, find_entry_points, named_constraint
 from optid.solving.solve import solve
-from optid.studies.arguments import Problem, argument_problems, arguments, points
+from optid.studies.arguments import argument_problems, arguments, points
+from optid.studies.messages import Problem, format_value, problems_of, refuse, unknown_keys
 from optid.studies.sources.systems import SYSTEMS, simulate
 
 AUTO, ALL = "auto", "all"
@@ -64,31 +64,29 @@ def _plain(value: Any) -> Any:
 
 
 def _several(value: Any) -> Any:
-    """Return one or several values as a tuple."""
     value = _plain(value)
     return tuple(value) if isinstance(value, list) else (value,)
 
 
-def _not_empty(values: tuple[Any, ...]) -> tuple[Any, ...]:
-    return values or refuse([((), "is empty; give at least one number")])
-
-
-def _distinct(values: tuple[Any, ...]) -> tuple[Any, ...]:
-    for i, value in enumerate(values):
-        if value in values[:i]:
-            refuse([((i,), f"{value} is there twice; leave one of them out")])
+def _distinct(values: Any) -> Any:
+    """Refuse values, or labels of entries, that are there twice."""
+    first: dict[Any, int] = {}
+    names = [getattr(value, "name", value) for value in values]
+    refuse([((i,), f"{name} is there twice; leave one of them out" if name is values[i] else
+             f"two entries are called {name!r}; give this one another name = \"...\"")
+            for i, name in enumerate(names) if first.setdefault(name, i) < i])
     return values
 
 
 def _seeds(value: Any) -> Any:
     """Return the seeds for their number or a list of them."""
     value = _plain(value)
-    if isinstance(value, int) and not isinstance(value, bool) and value > MOST_SEEDS:
+    if type(value) is int and value > MOST_SEEDS:
         raise ValueError(f"{value:,} seeds are too many: at most {MOST_SEEDS:,} are allowed")
-    if isinstance(value, int) and not isinstance(value, bool) and value > 0:
+    if type(value) is int and value > 0:
         return tuple(range(value))
     return tuple(value) if isinstance(value, list) else refuse([((), f"must be a positive integer or a list of "
-                                                                 f"integers; {_shown(value)} is not")])
+                                                                 f"integers; {format_value(value)} is not")])
 
 
 Text = Annotated[str, StringConstraints(strict=True, pattern=r"\S")]
@@ -98,24 +96,11 @@ Share = Annotated[Number, Field(gt=0, lt=1)]
 Count = Annotated[int, Field(strict=True, gt=0, lt=LARGEST), BeforeValidator(_plain)]
 Texts = Annotated[tuple[Text, ...], BeforeValidator(_several)]
 Accuracies = Annotated[tuple[Share, ...], AfterValidator(_distinct), BeforeValidator(_several)]
-Seeds = Annotated[tuple[Annotated[int, Field(strict=True, ge=0, lt=LARGEST)], ...], AfterValidator(_not_empty),
+Seeds = Annotated[tuple[Annotated[int, Field(strict=True, ge=0, lt=LARGEST)], ...], Field(min_length=1),
                   AfterValidator(_distinct), BeforeValidator(_seeds)]
 
 
-def refuse(problems: Sequence[Problem]) -> Any:
-    """Raise a `pydantic.ValidationError` with these problems, which gains the keys of what is being validated."""
-    if problems:
-        raise ValidationError.from_exception_data("study", [InitErrorDetails(
-            type=PydanticCustomError("study", "{text}", {"text": text}), loc=keys, input=None)
-            for keys, text in problems])
-
-
-def unknown_keys(raw: Mapping[str, Any], known: Sequence[str], more: str = "") -> list[Problem]:
-    """Return the keys of a table that are not known."""
-    return [((str(key),), f"unknown key {key!r}. {nearest(str(key), known)}{more}") for key in raw if key not in known]
-
-
-def _check_writable(options: Mapping[str, Any], *place: str) -> list[Problem]:
+def _unwritable(options: Mapping[str, Any], *place: str) -> list[Problem]:
     """Return the options that a study file cannot hold: no key of a cell could be computed from them."""
     import tomlkit
     from tomlkit.exceptions import ConvertError
@@ -163,12 +148,11 @@ class DataEntry:
     def _checked(self) -> "DataEntry":
         sources = [word for word, given in (("file", self.files), ("system", self.system), ("record", self.record))
                    if given]
-        problems: list[Problem] = []
-        if len(sources) != 1:
-            problems.append(((), "needs a file or a system" if not sources else f"only one of {', '.join(sources)}"))
+        problems: list[Problem] = [] if len(sources) == 1 else [
+            ((), f"only one of {', '.join(sources)}" if sources else "needs a file or a system")]
         if self.system and self.system not in SYSTEMS:
             problems.append((("system",), f"no system is called {self.system!r}. {nearest(self.system, SYSTEMS)}"))
-        if sources == ["system"] or not self.files:
+        if not self.files:
             problems += [((key,), f"{key} is for a file, which this entry is not") for key in self.options]
         if sources and not self.system:
             problems += [((key,), f"{key} is for a simulated system, which this entry is not")
@@ -201,15 +185,14 @@ def _reading(key: str, value: Any) -> Any:
         if isinstance(value, Mapping) and key != "columns":
             texts = list(value.values())
         if not texts or not all(isinstance(one, str) and one.strip() for one in texts):
-            raise ValueError(f"must be a text or a list of texts; {_shown(value)} is not")
+            raise ValueError(f"must be a text or a list of texts; {format_value(value)} is not")
         return value if isinstance(value, Mapping) else texts
     if key == "dt" and not (isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < np.inf):
-        raise ValueError(f"must be a positive number; {_shown(value)} is not")
+        raise ValueError(f"must be a positive number; {format_value(value)} is not")
     if key in ("time", "experiment") and not (isinstance(value, str) or key == "time" and value is False):
-        raise ValueError(f"must be a text; {_shown(value)} is not")
+        raise ValueError(f"must be a text; {format_value(value)} is not")
     if key in Format.__dataclass_fields__:
-        given: dict[str, Any] = {key: value}
-        Format(**given)
+        Format(**{key: value})  # type: ignore[arg-type]
     return value
 
 
@@ -233,18 +216,14 @@ class FormulationEntry:
 
     @model_validator(mode="after")
     def _checked(self) -> "FormulationEntry":
-        problems: list[Problem] = []
         function = _formulation(self.formulation)
         takes = arguments(function)
+        problems = [*argument_problems(self.formulation, function, self.options, KEYS["formulation"]),
+                    *_unwritable(self.options)]
         if self.constraints and takes is not None and "constraints" not in takes:
             problems.append((("constraints",), f"formulation {self.formulation!r} takes no constraints"))
-        problems += argument_problems(self.formulation, function, self.options, KEYS["formulation"])
-        problems += _check_writable(self.options)
         for i, text in enumerate(self.constraints):
-            word, known = text.partition(":")[0], find_entry_points(CONSTRAINTS)
             try:
-                if word not in known:
-                    raise ValueError(f"no constraint is called {word!r}. {nearest(word, known)}")
                 named_constraint(text)
             except Exception as error:  # any error of a third-party builder
                 problems.append((("constraints", i), str(error)))
@@ -258,7 +237,6 @@ class FormulationEntry:
 
 
 def _formulation(name: Any) -> Callable[..., Any]:
-    """Return a registered formulation; refuses others."""
     known = find_entry_points(FORMULATIONS)
     if not name or not isinstance(name, str):
         refuse([((), "needs formulation = \"NAME\" (optid formulations lists them)")])
@@ -298,19 +276,9 @@ class SolverEntry:
                 where = f"write {key} = ... beside solver" if key == "accuracy" else "it is a key of the study" \
                     if key in TOP else "the study sets it for every solver"
                 problems.append((("options", key), f"options are the solver's own, and {key!r} is none: {where}"))
-        refuse([*problems, *_check_writable(self.options, "options")])
+        refuse([*problems, *_unwritable(self.options, "options")])
         _set(self, name=self.name or self.solver, solver=word)
         return self
-
-
-# -- the axes ----------------------------------------------------------------------------------------------------------
-
-
-def _distinct_labels(entries: Any) -> Any:
-    names = [entry.name for entry in entries]
-    refuse([((i,), f"two entries are called {name!r}; give this one another name = \"...\"")
-            for i, name in enumerate(names) if name in names[:i]])
-    return entries
 
 
 def _spread(value: Any, marks: Sequence[str], table: Callable[[Any], Any]) -> list[Any]:
@@ -322,7 +290,6 @@ def _spread(value: Any, marks: Sequence[str], table: Callable[[Any], Any]) -> li
 
 
 def _data_axis(value: Any) -> list[Any]:
-    """Return the tables of the data entries."""
     def table(entry: Any) -> Any:
         if isinstance(entry, Data):
             return {"record": entry}
@@ -331,13 +298,7 @@ def _data_axis(value: Any) -> list[Any]:
             return {"system" if known else "file": str(entry)}
         return entry
 
-    return _spread(value, KEYS["data"], table) or refuse([((), "there is no [[data]]: a study needs at least one")])
-
-
-def _formulation_axis(value: Any) -> list[Any]:
-    """Return the tables of the formulation entries."""
-    return _spread(value, ("formulation",), lambda entry: entry) or refuse(
-        [((), "there is no [[formulation]]: a study needs at least one")])
+    return _spread(value, KEYS["data"], table)
 
 
 def _formulations_of(table: Any, info: ValidationInfo) -> tuple[FormulationEntry, ...]:
@@ -381,16 +342,8 @@ def installed_solvers() -> list[str]:
 
 
 def _solver_axis(value: Any) -> list[Any]:
-    """Return the tables of the solver entries."""
     value = installed_solvers() if _plain(value) in (ALL, [ALL]) else _plain(value)
-    return _spread(value, ("solver",), lambda entry: {"solver": entry} if isinstance(entry, str) else entry) or refuse(
-        [((), "there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]")])
-
-
-Formulations = Annotated[
-    tuple[Annotated[Any, PlainValidator(_formulations_of)], ...],
-    AfterValidator(lambda several: sum(several, ())), AfterValidator(_distinct_labels),
-    BeforeValidator(_formulation_axis)]
+    return _spread(value, ("solver",), lambda entry: {"solver": entry} if isinstance(entry, str) else entry)
 
 
 @dataclass(frozen=True, config=ConfigDict(arbitrary_types_allowed=True))
@@ -398,10 +351,14 @@ class Definition:
     """A grid of data x formulations x solvers x seeds, and the limits that hold for every cell; see `Study`."""
 
     name: Text
-    data: Annotated[tuple[DataEntry, ...], AfterValidator(_distinct_labels), BeforeValidator(_data_axis)]
-    formulations: Formulations
-    solvers: Annotated[tuple[SolverEntry, ...], AfterValidator(_distinct_labels), BeforeValidator(_solver_axis)]
-    accuracy: Annotated[Accuracies, AfterValidator(_not_empty)] = (1e-8,)
+    data: Annotated[tuple[DataEntry, ...], Field(min_length=1), AfterValidator(_distinct), BeforeValidator(_data_axis)]
+    formulations: Annotated[
+        tuple[Annotated[Any, PlainValidator(_formulations_of)], ...], Field(min_length=1),
+        AfterValidator(lambda several: sum(several, ())), AfterValidator(_distinct),
+        BeforeValidator(lambda value: _spread(value, ("formulation",), lambda entry: entry))]
+    solvers: Annotated[tuple[SolverEntry, ...], Field(min_length=1), AfterValidator(_distinct),
+                       BeforeValidator(_solver_axis)]
+    accuracy: Annotated[Accuracies, Field(min_length=1)] = (1e-8,)
     time_limit: Positive = 60.0
     memory_limit: Positive = 2000.0
     repetitions: Count = 1
@@ -410,92 +367,19 @@ class Definition:
     holdout: Annotated[Number, Field(ge=0, lt=1)] = 0.3
     folder: Path = field(default_factory=Path, compare=False)
 
+    def to_toml(self) -> str:
+        """Return the study as the text of a study file, which `Study.from_text` reads back.
 
-# -- messages ----------------------------------------------------------------------------------------------------------
+        Raises:
+            StudyError: a record in memory, which no file holds.
+        """
+        import tomlkit
 
-
-WORDS = {"a valid number": "a number", "a valid integer": "an integer", "a valid boolean": "true or false",
-         "a valid dictionary": "a table", "a valid string": "a text",
-         "a dictionary or an instance of DataEntry": "a record, optid.Data(u, y, dt), the name of a file or of a "
-         "simulated system, or a table of keys",
-         "a dictionary or an instance of FormulationEntry": "a table of keys with the name of a formulation",
-         "a dictionary or an instance of SolverEntry": "the name of a solver, or a table of keys"}
-"""Words of pydantic, and ours."""
-
-
-def problems_of(error: ValidationError) -> list[Problem]:
-    """Return the problems of a validation, each with its keys."""
-    found: list[Problem] = []
-    for line in error.errors(include_url=False):
-        text = line["msg"].removeprefix("Value error, ")
-        for pydantic, word in WORDS.items():
-            text = text.replace(pydantic, word)
-        if text.startswith("Input should "):
-            text = f"must {text.removeprefix('Input should ')}; {_shown(line['input'])} is not"
-        if line["type"] == "string_pattern_mismatch":
-            text = "must be a text that is not blank"
-        found.append((tuple("file" if key == "files" else key for key in line["loc"]), text))
-    return found
-
-
-def refuse_study(label: str, problems: Sequence[tuple[str, str]]) -> None:
-    """Raise a `StudyError` with one line per problem, if there are any; repeated problems count as one.
-
-    Args:
-        label: name of the study or its file.
-        problems: keys that lead to a value, written as in a study file, and what is wrong with it.
-    """
-    places: dict[str, list[str]] = {}
-    for where, text in problems:
-        places.setdefault(text, []).append(where)
-    lines = [f"{where}: {text}" if where else text for text, (first, *others) in places.items()
-             for where in [first + (f" and {len(others)} more" if others else "")]]
-    if lines:
-        count = f"{len(lines)} problems" if len(lines) > 1 else "a problem"
-        raise StudyError(f"{label} has {count}:" + "".join(f"\n  {line}" for line in lines))
-
-
-def format_keys(keys: Sequence[str | int], words: int) -> str:
-    """Write keys as in a study file: data[0].noise. The first so many solvers are words at its top."""
-    first, *rest = keys or ("",)
-    if first == "solvers" and rest and isinstance(rest[0], int):
-        first, rest = ("solvers", rest[:1]) if rest[0] < words else ("solver", [rest[0] - words, *rest[1:]])
-    text = str({"formulations": "formulation"}.get(str(first), first))
-    for part in rest:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}"
-    return text
-
-
-def _shown(value: Any) -> str:
-    """Write a value for messages."""
-    if isinstance(value, str):
-        return f"the text {value!r}"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, Mapping):
-        return "a table"
-    if isinstance(value, int) and value.bit_length() > 200:  # Python does not even write one of 5000 digits
-        return "a number of more than 60 digits"
-    text = " ".join(repr(list(value) if isinstance(value, tuple) else value).split())
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-# -- the text ----------------------------------------------------------------------------------------------------------
-
-
-def as_toml(study: Definition) -> str:
-    """Return the text of a study file.
-
-    Raises:
-        StudyError: a record in memory, which no file holds.
-    """
-    import tomlkit
-
-    top: dict[str, Any] = {f.name: _plain(getattr(study, f.name)) for f in fields(Definition)
-                           if f.name not in ("data", "formulations", "solvers", "folder")}
-    for key, entries in (("data", study.data), ("formulation", study.formulations), ("solver", study.solvers)):
-        top[key] = [_table(entry) for entry in entries]
-    return tomlkit.dumps(top)
+        text: dict[str, Any] = {f.name: _plain(getattr(self, f.name)) for f in fields(Definition)
+                                if f.name not in ("data", "formulations", "solvers", "folder")}
+        for key, entries in (("data", self.data), ("formulation", self.formulations), ("solver", self.solvers)):
+            text[key] = [_table(entry) for entry in entries]
+        return tomlkit.dumps(text)
 
 
 def _table(entry: Any) -> dict[str, Any]:

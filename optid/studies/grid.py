@@ -73,21 +73,19 @@ def cells(study: Definition) -> list[Cell]:
         contents = [content_hash(entry) for entry in entries]
     except OSError as error:  # it was there when the data were checked
         raise StudyError(f"study {study.name!r}: {error.filename} cannot be read: {error.strerror}") from error
-    found = [replace(cell, repetition=repetition)
-             for entry, content in zip(entries, contents) for record in _records(entry, study.seeds)
-             for formulation in study.formulations if formulation.is_for(entry)
-             for solver in study.solvers for accuracy in solver.accuracy or study.accuracy
-             for cell in [_cell(study, entry, content, record, formulation, solver, accuracy)]
-             for repetition in range(study.repetitions)]
-    seen: dict[tuple[str, int], Cell] = {}
-    for cell in found:
-        other = seen.setdefault(cell.identity, cell)
-        if other is not cell:
-            names = [f"{axis} {getattr(other, axis)!r} and {getattr(cell, axis)!r}"
-                     for axis in ("data", "formulation", "solver") if getattr(other, axis) != getattr(cell, axis)]
-            raise StudyError(f"study {cell.study!r} has the same cell twice: {', '.join(names)} differ in "
-                             "nothing that determines the result. Leave one of them out")
-    return found
+    found: dict[str, Cell] = {}
+    for entry, content in zip(entries, contents):
+        formulations = [one for one in study.formulations if one.is_for(entry)]
+        for record, formulation, solver in product(_records(entry, study.seeds), formulations, study.solvers):
+            for accuracy in solver.accuracy or study.accuracy:
+                cell = _cell(study, entry, content, record, formulation, solver, accuracy)
+                other = found.setdefault(cell.key, cell)
+                if other is not cell:
+                    names = [f"{axis} {getattr(other, axis)!r} and {getattr(cell, axis)!r}" for axis in (
+                        "data", "formulation", "solver") if getattr(other, axis) != getattr(cell, axis)]
+                    raise StudyError(f"study {cell.study!r} has the same cell twice: {', '.join(names)} differ in "
+                                     "nothing that determines the result. Leave one of them out")
+    return [replace(cell, repetition=k) for cell in found.values() for k in range(study.repetitions)]
 
 
 def number_of_cells(study: Definition) -> int:
@@ -123,20 +121,21 @@ def content_hash(entry: DataEntry) -> str:
     Raises:
         OSError: a file, whose name must be absolute, cannot be read.
     """
-    digests = []
-    for name in entry.files:
-        with open(name, "rb") as file:
-            digests.append(hashlib.file_digest(file, "sha256"))
-    if len(digests) > 1:
-        return hashlib.sha256(b"".join(digest.digest() for digest in digests)).hexdigest()
     if (data := entry.record) is not None:
-        digests = [hashlib.sha256()]
+        digest = hashlib.sha256()
         channels = (data.inputs, data.outputs, data.input_units, data.output_units, data.dt)
-        digests[0].update(repr((channels, data.transform)).encode())
+        digest.update(repr((channels, data.transform)).encode())
         for array in (array for experiment in data.experiments for array in (experiment.u, experiment.y)):
-            digests[0].update(repr(array.shape).encode())
-            digests[0].update(np.ascontiguousarray(array).tobytes())
-    return digests[0].hexdigest() if digests else ""
+            digest.update(repr(array.shape).encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+    digests = [_file_digest(name) for name in entry.files]
+    return hashlib.sha256(b"".join(digests)).hexdigest() if len(digests) > 1 else b"".join(digests).hex()
+
+
+def _file_digest(name: str) -> bytes:
+    with open(name, "rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
 
 
 _Simulated = tuple[int | None, float | None, int | None]
@@ -171,8 +170,7 @@ def _cell(study: Definition, entry: DataEntry, content: str, record: _Simulated,
         noise=noise, seed=seed, formulation_name=formulation.formulation, options=dict(formulation.options),
         constraints=formulation.constraints, solver_name=solver.solver, solver_options=dict(solver.options),
         accuracy=accuracy, warm=study.warm, time_limit=study.time_limit, memory_limit=study.memory_limit,
-        holdout=study.holdout, refusal=_refusal(solver.solver),
-    )
+        holdout=study.holdout, refusal=_refusal(solver.solver))
 
 
 def _refusal(solver: str) -> str:
@@ -224,8 +222,7 @@ def source_hash(module: str) -> str:
     if spec is None or spec.origin is None:
         return "unknown"
     try:
-        with open(spec.origin, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+        return _file_digest(spec.origin).hex()[:16]
     except OSError:
         return "unknown"
 

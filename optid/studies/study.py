@@ -1,5 +1,6 @@
 """A study: its definition, the checks of its data, and its runs."""
 
+import tempfile
 import tomllib
 from importlib.resources import files
 from pathlib import Path
@@ -8,19 +9,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from optid.errors import StudyError
-from optid.studies.definition import (
-    ALL,
-    KEYS,
-    TOP,
-    Definition,
-    as_toml,
-    format_keys,
-    installed_solvers,
-    problems_of,
-    refuse_study,
-    unknown_keys,
-)
-from optid.studies.execution.running import run_to_frame
+from optid.studies.definition import ALL, KEYS, TOP, Definition, installed_solvers
+from optid.studies.execution.running import run
+from optid.studies.messages import format_keys, problems_of, refuse_study, unknown_keys
+from optid.studies.storage.rows import COLUMNS, NAMES
 from optid.studies.trial import check_data
 
 HINT = "write texts in quotation marks, paths in single ones, several values in [ ], and one key = value per line"
@@ -54,10 +46,17 @@ class Study(Definition):
     """
 
     def __init__(self, name: str, data: Any, formulations: Any, solvers: Any, **settings: Any) -> None:
+        self._define(f"study {name!r}", 0, [], name=name, data=data, formulations=formulations, solvers=solvers,
+                     **settings)
+
+    def _define(self, label: str, words: int, problems: list[tuple[str, str]], /, **values: Any) -> None:
+        """Set the fields, or refuse them with the problems that are known already; the first solvers are words."""
         try:
-            super().__init__(name=name, data=data, formulations=formulations, solvers=solvers, **settings)
+            super().__init__(**values)
         except ValidationError as error:
-            refuse_study(f"study {name!r}", [(format_keys(keys, 0), text) for keys, text in problems_of(error)])
+            found = [(format_keys(keys, words), text) for keys, text in problems_of(error)]
+            problems += [one for one in found if one[0] not in dict(problems)]
+        refuse_study(label, problems)
 
     @classmethod
     def from_toml(cls, path: str | Path) -> "Study":
@@ -104,15 +103,9 @@ class Study(Definition):
         words = installed_solvers() if words in (ALL, [ALL]) else words if isinstance(words, list) else [words]
         settings = {key: value for key, value in raw.items() if key in TOP and key not in ("solvers", *KEYS)}
         study = cls.__new__(cls)
-        solvers = [*words, *tables] if isinstance(tables, list) else words
-        try:
-            Definition.__init__(study, **{
-                "name": title, **settings, "data": raw.get("data", []), "solvers": solvers,
-                "formulations": raw.get("formulation", []), "folder": Path(folder)})
-        except ValidationError as error:
-            found = [(format_keys(keys, len(words)), text) for keys, text in problems_of(error)]
-            problems += [one for one in found if one[0] not in dict(problems)]
-        refuse_study(label, problems)
+        study._define(label, len(words), problems, **{
+            "name": title, **settings, "data": raw.get("data", []), "formulations": raw.get("formulation", []),
+            "solvers": [*words, *tables] if isinstance(tables, list) else words, "folder": Path(folder)})
         check_data(study, label)
         return study
 
@@ -121,14 +114,6 @@ class Study(Definition):
         """Return the built-in study."""
         text = files("optid.studies").joinpath("example.toml").read_text(encoding="utf-8")
         return cls.from_text(text, label="the built-in study")
-
-    def to_toml(self) -> str:
-        """Return the study as the text of a study file, which `from_text` reads back.
-
-        Raises:
-            StudyError: a record in memory, which no file holds.
-        """
-        return as_toml(self)
 
     def check_data(self) -> None:
         """Read every data file, build every formulation and try solver options on a short record, once.
@@ -151,4 +136,15 @@ class Study(Definition):
             A pandas frame with the columns of `optid.studies.storage.rows`; a list of dictionaries where pandas is not
             installed.
         """
-        return run_to_frame(self, db, **settings)
+        with tempfile.TemporaryDirectory() as temporary:
+            rows = run(self, db or Path(temporary) / "study.sqlite", **settings)
+        try:
+            import pandas as pd
+        except ImportError:
+            return rows
+        kinds = {"number": "float64", "integer": "Int64", "flag": "boolean"}
+        frame = pd.DataFrame(rows, columns=list(NAMES))
+        frame = frame.astype({c.name: "bool" if c.kind == "flag" and c.always else kinds[c.kind]
+                              for c in COLUMNS if c.kind in kinds})
+        frame["started"] = pd.to_datetime(frame["started"], utc=True)
+        return frame

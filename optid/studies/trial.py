@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,9 @@ from optid.program.solution import Status
 from optid.registry import formulation as look_up
 from optid.registry import named_constraint
 from optid.solving.solve import solve
-from optid.studies.definition import DataEntry, Definition, FormulationEntry, refuse_study
+from optid.studies.definition import DataEntry, Definition, FormulationEntry
 from optid.studies.grid import with_absolute_paths
+from optid.studies.messages import refuse_study
 from optid.studies.records import read_entry
 from optid.studies.sources.systems import simulate, system
 
@@ -28,6 +30,8 @@ LONGEST = 300  # characters of the message of a solver that fails
 
 Problems = list[tuple[str, str]]
 """Keys as in a study file, and what is wrong with the value."""
+Records = dict[str, Data]
+"""The whole records of a study that are not simulated, by their labels."""
 
 
 def check_data(study: Definition, label: str = "") -> None:
@@ -39,38 +43,14 @@ def check_data(study: Definition, label: str = "") -> None:
 
 def _data_problems(study: Definition) -> Problems:
     """Return unreadable data or, if there are none, impossible formulations and wrong options."""
-    records = _Records(study)
-    problems = [one for i, entry in enumerate(study.data) for one in _unreadable(f"data[{i}]", entry, records)]
+    records: Records = {}
+    problems = [one for i, entry in enumerate(study.data)
+                for one in _unreadable(f"data[{i}]", entry, study.folder, records)]
     return problems or [*_impossible(study, records), *_wrong_options(study, records)]
 
 
-class _Records:
-    """The records of a study, each read once."""
-
-    def __init__(self, study: Definition) -> None:
-        self.folder = study.folder
-        self._read: dict[str, Data] = {}
-
-    def read(self, entry: DataEntry) -> Data:
-        """Return the whole record of an entry that is not simulated."""
-        if entry.name not in self._read:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DataWarning)  # repeated when the record is used
-                self._read[entry.name] = read_entry(with_absolute_paths(entry, self.folder))
-        return self._read[entry.name]
-
-    def beginning(self, entry: DataEntry, samples: float = SHORT) -> Data:
-        """Return the beginning of a record, or a simulated one, of so many samples at most."""
-        if entry.system is not None:
-            longest = max(entry.samples or (system(entry.system).samples,))
-            return simulate(entry.system, int(min(samples, longest)))[0]
-        whole = self.read(entry)
-        is_short = whole.experiments[0].n_samples <= samples
-        return whole if is_short else whole.select(experiments=0).window(0, int(samples))
-
-
-def _unreadable(key: str, entry: DataEntry, records: _Records) -> Problems:
-    """Return what is wrong with the files of an entry, at the key that causes it."""
+def _unreadable(key: str, entry: DataEntry, folder: Path, records: Records) -> Problems:
+    """Read an entry that is not simulated, or return what is wrong with its files at the key that causes it."""
     from optid.data.reading.columns import choose
     from optid.data.reading.sources import open_tables
 
@@ -79,19 +59,31 @@ def _unreadable(key: str, entry: DataEntry, records: _Records) -> Problems:
     try:
         for number, name in enumerate(entry.files):
             at = f"{key}.file[{number}]"
-            table = open_tables(records.folder / name, Format(**words))[0]
+            table = open_tables(folder / name, Format(**words))[0]
             for channels, letter in (("inputs", "u"), ("outputs", "y")):
                 at = f"{key}.{channels}"
                 choose(table.names, entry.options.get(channels), letter, table.label)
         at = f"{key}.file"
-        if entry.files:
-            records.read(entry)
+        if entry.system is None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DataWarning)  # repeated when the record is used
+                records[entry.name] = read_entry(with_absolute_paths(entry, folder))
     except DataError as error:
         return [(at, str(error))]
     return []
 
 
-def _impossible(study: Definition, records: _Records) -> Problems:
+def _beginning(entry: DataEntry, records: Records, samples: float = SHORT) -> Data:
+    """Return the beginning of a record, or a simulated one, of so many samples at most."""
+    if entry.system is not None:
+        longest = max(entry.samples or (system(entry.system).samples,))
+        return simulate(entry.system, int(min(samples, longest)))[0]
+    whole = records[entry.name]
+    is_short = whole.experiments[0].n_samples <= samples
+    return whole if is_short else whole.select(experiments=0).window(0, int(samples))
+
+
+def _impossible(study: Definition, records: Records) -> Problems:
     """Return the formulations whose arguments or constraints do not fit any of their data.
 
     Each is built on a short record; what only a longer one can show becomes a row of the run.
@@ -99,8 +91,8 @@ def _impossible(study: Definition, records: _Records) -> Problems:
     found = []
     for entry in study.formulations:
         its_data = [one for one in study.data if entry.is_for(one)]
-        if all(_refusal(entry, records.beginning(one)) for one in its_data):
-            reasons = [_refusal(entry, records.beginning(one, np.inf)) for one in its_data]  # was it too short?
+        if all(_refusal(entry, _beginning(one, records)) for one in its_data):
+            reasons = [_refusal(entry, _beginning(one, records, np.inf)) for one in its_data]  # was it too short?
             if reasons and all(reasons):
                 found.append((f"formulation[{entry.name!r}]", f"the formulation does not fit the data: {reasons[0]}"))
     return found
@@ -131,7 +123,7 @@ def build_problem(formulation: str, record: Data, constraints: Sequence[str], op
     return look_up(formulation)[1](record, **options, **({"constraints": named} if named else {}))
 
 
-def _wrong_options(study: Definition, records: _Records) -> Problems:
+def _wrong_options(study: Definition, records: Records) -> Problems:
     """Return the options with which a solver fails on a short record that it solves without them."""
     found: Problems = []
     for entry in study.solvers:
@@ -146,12 +138,12 @@ def _wrong_options(study: Definition, records: _Records) -> Problems:
     return found
 
 
-def _solved_without(solver: str, study: Definition, records: _Records) -> Iterator[Any]:
+def _solved_without(solver: str, study: Definition, records: Records) -> Iterator[Any]:
     """Yield programmes on short records that a solver solves without any option."""
     for entry in study.formulations:
         for one in filter(entry.is_for, study.data):
             try:
-                programme = _first_programme(entry, records.beginning(one))
+                programme = _first_programme(entry, _beginning(one, records))
                 if _solve(programme, solver, {}).status in (Status.OPTIMAL, Status.LOCAL):
                     yield programme
             except Exception:  # not built, not installed, not for this formulation

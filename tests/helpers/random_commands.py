@@ -15,14 +15,13 @@ import numpy as np
 import typer.main
 from damage import bytes_of
 from random_calls import BASES, CONSTRAINTS, limited
-from study_rows import rows
+from study_rows import append, rows
 
 import optid
 from optid.cli.app import app
 from optid.faults import diagnose, dictionary
 from optid.registry import FORMULATIONS, find_entry_points
 from optid.studies.execution.running import run
-from optid.studies.storage.store import append
 from optid.studies.study import Study
 
 EXIT_CODES = {0, 2, 3, 4}

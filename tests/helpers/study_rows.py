@@ -3,11 +3,13 @@
 import hashlib
 import json
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from optid.studies.storage.rows import as_json, complete
+from optid.studies.storage.store import Store
 
 START = datetime(2026, 3, 1, 8, 0, tzinfo=UTC)
 # solver: (factor of its time, share of runs that fail, share of false claims, exponent of the growth with N)
@@ -102,6 +104,23 @@ def hash_of(*labels: Any) -> int:
     return int(place(*labels)[:8], 16)
 
 
+# ---- a database
+
+
+def append(path, made):
+    """Append rows to a database, which is made when it is not there."""
+    with Store(path, write=True) as store:
+        store.append(made)
+
+
+def finished_rows(path, study=None):
+    """(key, repetition) of every row of a database, or of one study; none where there is no database yet."""
+    if not Path(path).exists():
+        return set()
+    with Store(path) as store:
+        return store.finished_rows(study)
+
+
 # ---- rows by hand, for the tests of a verdict
 
 
@@ -125,6 +144,11 @@ def times_of(*factors, problems=20, spread=0.1, seed=0):
     rng = np.random.default_rng(seed)
     base = np.exp(rng.normal(size=(problems, 1)))
     return base * np.array(factors) * np.exp(spread * rng.normal(size=(problems, len(factors))))
+
+
+def share(profile, factor):
+    """The share of problems that a performance profile has within a factor of the fastest time."""
+    return max(profile[1][profile[0] <= factor], default=0.0)
 
 
 # ---- complete rows by hand, for the tests of comparisons

@@ -2,7 +2,6 @@
 
 import json
 import time
-from collections import OrderedDict
 from dataclasses import replace
 
 import numpy as np
@@ -94,7 +93,7 @@ def test_the_solver_has_the_time_that_loading_left_and_the_second_solve_the_same
         limits.append(settings.time_limit)
         return back_ends()["ipopt"].run(program, settings)
 
-    monkeypatch.setattr(cells, "_records", OrderedDict())
+    monkeypatch.setattr(cells, "_records", {})
     monkeypatch.setattr(cells, "load", lambda cell, real=cells.load: time.sleep(0.3) or real(cell))
     monkeypatch.setattr(cells, "REHEARSED", 0.0)
     row = run_cell(one(solver(run), warm=True, time_limit=50.0))

@@ -6,7 +6,7 @@ import pytest
 from browser import CHROMIUM, NO_BROWSER, Browser
 from html_page import Page
 from study_rows import rows as synthetic
-from study_rows import run
+from study_rows import run, share
 
 from optid.errors import DataError
 from optid.show.studies import profile_chart, study_document
@@ -44,10 +44,10 @@ def test_a_profile_is_a_step_function_through_its_points(verdict):
     chart = profile_chart(verdict.overall)
     for series in chart.series:
         profile = verdict.overall.profiles[series.name]
-        assert series.xs.shape == series.ys.shape and series.ys[0] == 0.0 and series.ys[-1] == profile(1e9)
-        for factor, share in zip(profile.factors, profile.shares):
+        assert series.xs.shape == series.ys.shape and series.ys[0] == 0.0 and series.ys[-1] == share(profile, 1e9)
+        for factor, height in zip(*profile):
             here = series.ys[series.xs == factor]
-            assert here[-1] == share and here[0] == pytest.approx(profile(factor - 1e-9))
+            assert here[-1] == height and here[0] == pytest.approx(share(profile, factor - 1e-9))
 
 
 def test_every_word_for_how_a_run_ended_is_explained(page, verdict):

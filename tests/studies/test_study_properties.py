@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from study_rows import append, finished_rows
 
 from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, STATUSES, as_json, complete
-from optid.studies.storage.store import Store, append, finished_rows, read_rows
+from optid.studies.storage.store import Store, read_rows
 
 TEXT = st.text(st.characters(exclude_categories=()), max_size=40)
 NUMBERS = st.floats(allow_nan=True, allow_infinity=True)

@@ -23,18 +23,13 @@ def test_synthetic_rows_hold_every_outcome_but_error_and_false_claims():
     assert made == rows(3000, seed=1)
 
 
-def test_non_finite_numbers_become_empty():
-    row = dict(rows(1)[0])
-    row["objective"], row["gap"], row["bound"], row["scale"] = math.nan, math.inf, np.float64(-math.inf), 10**400
+def test_non_finite_numbers_become_empty_and_numpy_scalars_plain_numbers():
+    row = rows(1)[0] | {"objective": math.nan, "gap": math.inf, "bound": np.float64(-math.inf), "scale": 10**400,
+                        "iterations": np.int32(7), "proved": np.bool_(True), "violation": np.float32(0.5)}
     done = complete(row)
     assert done["objective"] is done["gap"] is done["bound"] is done["scale"] is None
-    assert as_json([1.0, math.nan, np.array([math.inf, 2.0])]) == "[1.0, null, [null, 2.0]]"
-
-
-def test_numpy_scalars_become_plain_numbers():
-    row = {**rows(1)[0], "iterations": np.int32(7), "proved": np.bool_(True), "violation": np.float32(0.5)}
-    done = complete(row)
     assert [type(done[name]) for name in ("iterations", "proved", "violation")] == [int, bool, float]
+    assert as_json([1.0, math.nan, np.array([math.inf, 2.0])]) == "[1.0, null, [null, 2.0]]"
 
 
 @pytest.mark.parametrize("change, words", [

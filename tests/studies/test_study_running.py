@@ -12,15 +12,16 @@ from pathlib import Path
 
 import pytest
 import study_trouble
+from study_rows import finished_rows
 from study_trouble import behave, cell, row
 
 from optid.errors import DatabaseError, StudyError
 from optid.studies.definition import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.execution import running
 from optid.studies.execution.executors import run_here
-from optid.studies.execution.running import run, run_to_frame
+from optid.studies.execution.running import run
 from optid.studies.storage.rows import NAMES
-from optid.studies.storage.store import Store, finished_rows, read_rows
+from optid.studies.storage.store import Store, read_rows
 from optid.studies.study import Study
 
 STUDY = Study("trouble", (DataEntry("none", system="dead_zone"),),
@@ -83,22 +84,17 @@ def test_what_is_finished_is_kept_when_something_stops_the_run(path, grid, error
     with pytest.raises(error):
         run(STUDY, path, executor=hands)
     assert hands.closed and len(finished_rows(path)) == 4
-    rest = Hands()
-    run(STUDY, path, executor=rest)
-    assert rest.ran == [4, 5, 6, 7, 8, 9] and len(finished_rows(path)) == 10
-
-
-def test_an_error_of_the_caller_s_progress_keeps_what_is_finished(path, grid):
-    grid([cell(k) for k in range(5)])
 
     def progress(done, total, found):
-        if done == 3:
+        if done == 7:
             raise OSError("the terminal is gone")
 
-    hands = Hands()
+    rest = Hands()
     with pytest.raises(OSError):
-        run(STUDY, path, executor=hands, progress=progress)
-    assert hands.closed and len(finished_rows(path)) == 3
+        run(STUDY, path, executor=rest, progress=progress)
+    assert rest.closed and len(finished_rows(path)) == 7
+    run(STUDY, path, executor=rest)
+    assert rest.ran == [4, 5, 6, 7, 8, 9] and len(finished_rows(path)) == 10
 
 
 def test_rows_nobody_asked_for_and_doubles_are_left_out(path, grid):
@@ -211,17 +207,6 @@ def test_changed_data_stay_accepted_when_an_entry_was_taken_out(path, grid):
     assert hands.ran == []  # the former content again: its rows were kept
 
 
-def test_an_entry_that_is_taken_out_leaves_the_report_and_comes_back_without_a_run(path, grid):
-    cells = [cell(k, solver) for k, solver in enumerate(("fine", "leave", "fine"))]
-    for now in (cells, cells[::2], cells):
-        grid(now)
-        hands = Hands()
-        rows = run(STUDY, path, executor=hands)
-        assert [r["key"] for r in rows] == [c.key for c in now]
-        assert set(read_rows(path)["solver"]) == {c.solver for c in now}
-    assert hands.ran == []
-
-
 def test_two_runs_of_a_study_at_once_are_refused_and_two_studies_are_not(path, tmp_path, grid):
     import os
     cells = grid([cell(0)])
@@ -321,22 +306,11 @@ def test_frames(path, grid):
     pd = pytest.importorskip("pandas")
     grid([cell(k) for k in range(3)])
     for db in (path, None):
-        frame = run_to_frame(STUDY, db, executor=Hands())
+        frame = STUDY.run(db, executor=Hands())
         assert tuple(frame.columns) == NAMES and len(frame) == 3
         assert frame["objective"].isna().all() and frame["objective"].dtype == float
         assert frame["reached"].dtype == bool and frame["unknowns"].dtype == "Int64"
         assert isinstance(frame["started"].iloc[0], pd.Timestamp)
-
-
-def test_every_trouble_in_one_study(path, grid):
-    ways = ["fine", "segfault", "fine", "loop", "hog", "leave", "raise", "fine", "partial", "fine"]
-    limits = {"loop": {"time_limit": 0.5}, "hog": {"memory_limit": 500.0}}
-    grid([cell(k, do, **limits.get(do, {})) for k, do in enumerate(ways)])
-    rows = run(STUDY, path, executor=partial(run_here, function=behave, workers=2))
-    assert [r["outcome"] for r in rows] == ["done", "crashed", "done", "time limit", "memory limit", "crashed", "error",
-                                            "done", "error", "done"]
-    assert all(r["reason"] for r in rows if r["outcome"] != "done")
-    assert len(finished_rows(path)) == 10
 
 
 def test_a_real_study_from_python_to_its_frame():

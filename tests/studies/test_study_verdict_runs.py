@@ -65,22 +65,23 @@ def test_a_run_counts_only_where_the_accuracy_was_verified_at_the_best_objective
     assert list(states_of_rows(columns([run("good"), run("other", **change)]), found)) == ["solved", state]
 
 
-def test_a_vanishing_objective_is_compared_on_the_scale_of_the_problem():
-    found = tabulate(columns([run("a", objective=1e-14), run("b", objective=1e-9), run("c", objective=1e-6)]))
-    assert list(found.state[0]) == ["solved", "solved", "worse minimum"]  # a hundredth of 10 is the yardstick
+LIAR = run("liar", objective=0.5, false_claim=True, status_verified="inaccurate")
 
 
-def test_a_worse_run_cannot_set_the_objective_to_beat():
-    liar = run("liar", objective=0.5, false_claim=True, status_verified="inaccurate")
-    loose = run("loose", objective=0.6, violation=1e-3)
-    found = tabulate(columns([run("good"), liar, loose]))
-    assert list(found.state[0]) == ["solved", "false claim", "less accurate"]
+@pytest.mark.parametrize("rows, states", [
+    ([run("a", objective=1e-14), run("b", objective=1e-9), run("c", objective=1e-6)],  # a hundredth of the scale, 10,
+     ["solved", "solved", "worse minimum"]),  # is the yardstick of a vanishing objective
+    ([run("good"), LIAR, run("loose", objective=0.6, violation=1e-3)],  # no worse run sets the objective to beat
+     ["solved", "false claim", "less accurate"]),
+])
+def test_objectives_are_compared_with_the_best_verified_one_on_the_scale_of_the_problem(rows, states):
+    assert list(tabulate(columns(rows)).state[0]) == states
 
 
 def test_an_answer_to_a_looser_accuracy_of_its_own_is_held_to_the_common_one():
     rows = [run("a", p) for p in range(3)] + [run("loose", p, accuracy=1e-3, stationarity=1e-3) for p in range(2)]
-    assert list(tabulate(columns(rows)).state[:, 1]) == ["less accurate", "less accurate", "not run"]
-    assert list(tabulate(columns(rows), accuracy=1e-3).state[:, 1]) == ["solved", "solved", "not run"]
+    for accuracy, state in ((None, "less accurate"), (1e-3, "solved")):
+        assert list(tabulate(columns(rows), accuracy).state[:, 1]) == [state, state, "not run"]
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -225,15 +226,12 @@ def test_what_is_no_table_of_runs_is_refused(given_rows, message):
         conclude(given_rows)
 
 
-def test_a_comparison_of_no_rows_is_refused():
-    with pytest.raises(DataError, match="no rows to compare"):
-        compare([])
-
-
 @pytest.mark.parametrize("nothing", [[], {}])
 def test_no_rows_at_all_say_so(nothing):
     verdict = conclude(nothing)
     assert verdict.headline.word == "Nothing to compare" and not verdict.recommended and not verdict.statements
+    with pytest.raises(DataError, match="no rows to compare"):
+        compare([])
 
 
 def test_data_on_which_every_run_ends_with_an_error_are_named():

@@ -4,7 +4,6 @@ import os
 import re
 import resource
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -149,56 +148,14 @@ def test_a_cell_that_cannot_be_sent_is_a_row():
     assert rows[1]["outcome"] == "done"
 
 
-def test_closing_ends_the_workers_at_once():
-    rows = run_here([cell(0), cell(1, "loop"), cell(2, "loop")], behave, workers=2)
-    pid = next(rows)["unknowns"]
-    assert pid in cell_workers(os.getpid())
-    clock = time.monotonic()
-    rows.close()
-    assert gone(pid) and time.monotonic() - clock < 30.0
-    assert not cell_workers(os.getpid())
-
-
-def test_workers_die_with_a_parent_that_is_killed(tmp_path):
-    program = f"""
-import sys
-sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
-from study_trouble import behave, cell
-from optid.studies.execution.executors import run_here
-for row in run_here([cell(0), cell(1), cell(2, "stuck"), cell(3, "stuck")], behave, workers=2):
-    print(row["unknowns"], flush=True)
-"""
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
-        parent.stdout.readline(), parent.stdout.readline()
-        children = cell_workers(parent.pid)
-        assert len(children) == 2
-        time.sleep(0.2)
-        parent.kill()
-    wait_for(lambda: all(map(gone, children)))
-
-
-def test_no_guard_of_the_main_module_is_needed(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(f"""
-import sys
-sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
-from study_trouble import behave, cell
-from optid.studies.execution.executors import run_here
-print("once", [row["outcome"] for row in run_here([cell(0)], behave, workers=1)])
-""")
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=600)
-    assert done.stdout == "once ['done']\n", done.stderr
-
-
 def test_a_function_without_a_name_is_refused():
     with pytest.raises(StudyError, match="workers cannot import"):
         list(run_here([cell(0)], lambda cell: {}, workers=1))
 
 
 def test_workers_that_do_not_start_are_an_error_with_their_last_words(monkeypatch):
-    monkeypatch.setattr("optid.studies.execution.apart.prepare", study_trouble.fail_to_start)
-    monkeypatch.setattr("optid.studies.execution.apart.run_cell", behave)
+    monkeypatch.setattr("optid.studies.execution.executors.prepare", study_trouble.fail_to_start)
+    monkeypatch.setattr("optid.studies.execution.executors.run_cell", behave)
     with pytest.raises(StudyError, match="before it was ready: ModuleNotFoundError"):
         list(run_here([cell(0)], behave, workers=1))
 

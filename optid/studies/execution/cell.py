@@ -7,9 +7,9 @@ worker: `lost_row` makes the row of a cell that returned none.
 import json
 import time
 import warnings
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ REHEARSED = 0.25  # share of the time limit up to which the first cell of its ki
 kept_row: Path | None = None
 """File for a row that is valid if the rest of the current cell fails, in a process of its own."""
 
-_records: OrderedDict[tuple[Any, ...], Record] = OrderedDict()
+_records: dict[tuple[Any, ...], Record] = {}
 _rehearsed: set[tuple[str, str, bool]] = set()
 
 
@@ -53,9 +53,8 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     """Run a cell and return its row, whatever the fit does.
 
     The first cell of a formulation and solver in a process is run twice if it is quick, and the second run counts: the
-    times exclude importing a solver and loading compiled kernels.
-    The solver's time limit is what loading the record left
-    of the limit of the cell; the caller stops a process that exceeds it.
+    times exclude importing a solver and loading compiled kernels. The solver's time limit is what loading the record
+    left of the limit of the cell; the caller stops a process that exceeds it.
     """
     clock = time.perf_counter()
     row = _run(cell, clock)
@@ -108,8 +107,9 @@ def keep(row: Mapping[str, Any]) -> None:
         kept_row.write_text(json.dumps(dict(row)))
 
 
+@cache
 def prepare() -> None:
-    """Import what every fit needs and load compiled kernels, so that no cell includes that time."""
+    """Import what every fit needs and load compiled kernels, once in a process, so that no cell includes that time."""
     from optid.examples import dead_zone
     from optid.identify.validation.predictions import one_step, simulate_outputs
 
@@ -153,13 +153,16 @@ def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit
     """Return the columns of a fit, and the fit if it is to be solved again; `limit`: seconds for each programme."""
     data = record.data
     held = 0 if record.holdout is None else record.holdout.n_samples
-    row: dict[str, Any] = {"n_samples": data.n_samples + held, "n_estimation": data.n_samples, "n_inputs": data.m,
-                           "n_outputs": data.l}
-    _check_main_step(cell)
+    name, pose = formulation(cell.formulation_name)
+    solvers = choose_solvers(name, pose, {**defaults(pose), **cell.options, "constraints": cell.constraints},
+                             cell.solver_name)
+    if solvers.skips_main:  # it would solve other steps than the one whose objective is compared
+        raise SolverRefused(f"{cell.solver_name} does not take {solvers.main!r}, the main step of {name!r}")
     fitted = fit(data, cell.formulation_name, solver=cell.solver_name, accuracy=cell.accuracy, time_limit=limit,
                  isolate=False, constraints=cell.constraints, solver_options=dict(cell.solver_options), raises=False,
                  **cell.options)
-    row |= _verdict(fitted)
+    row: dict[str, Any] = {"n_samples": data.n_samples + held, "n_estimation": data.n_samples, "n_inputs": data.m,
+                           "n_outputs": data.l, **_verdict(fitted)}
     remarks = [row["reason"]]
     if fitted.model is not None:
         row |= _figures(fitted.model, record, remarks)
@@ -169,27 +172,17 @@ def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit
     return row, fitted if cell.warm and plain and row["outcome"] == DONE else None
 
 
-def _check_main_step(cell: Cell) -> None:
-    """Refuse a solver that would solve other steps of a formulation than the one whose objective is compared."""
-    name, pose = formulation(cell.formulation_name)
-    arguments = {**defaults(pose), **cell.options, "constraints": cell.constraints}
-    solvers = choose_solvers(name, pose, arguments, cell.solver_name)
-    if solvers.skips_main:
-        raise SolverRefused(f"{cell.solver_name} does not take {solvers.main!r}, the main step of {name!r}")
-
-
 def _loaded(cell: Cell) -> Record:
     """Return the record of a cell, kept from the last few that this worker loaded."""
     entry = cell.data_source
     identity = (cell.data_hash, entry.system, cell.samples, cell.noise, cell.seed, cell.holdout, as_json(entry.options))
-    if identity not in _records:
-        if entry.files and content_hash(entry) != cell.data_hash:
-            raise DataError(f"{', '.join(entry.files)}: not the content that the study started with; it changed since, "
-                            "or this machine has another file of that name")
-        _records[identity] = load(cell)
-        while len(_records) > KEPT:
-            _records.popitem(last=False)
-    _records.move_to_end(identity)
+    record = _records.pop(identity, None)
+    if record is None and entry.files and content_hash(entry) != cell.data_hash:
+        raise DataError(f"{', '.join(entry.files)}: not the content that the study started with; it changed since, "
+                        "or this machine has another file of that name")
+    _records[identity] = record or load(cell)  # the last one used at the end
+    if len(_records) > KEPT:
+        del _records[next(iter(_records))]
     return _records[identity]
 
 

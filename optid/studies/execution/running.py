@@ -1,6 +1,5 @@
 """Run a study into its database: cells with a row are not run again, and finished rows are never lost."""
 
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -12,11 +11,11 @@ from typing import Any
 
 from optid.data.reduction import available_cores
 from optid.errors import DatabaseError, StudyError, nearest
-from optid.studies.definition import Definition, as_toml
+from optid.studies.definition import Definition
 from optid.studies.execution.cell import known_columns, lost_row
 from optid.studies.execution.executors import run_here, run_with
 from optid.studies.grid import Cell, cells, check_unchanged, with_absolute_paths
-from optid.studies.storage.rows import COLUMNS, KILLED, NAMES, OUTCOMES, REFUSED
+from optid.studies.storage.rows import KILLED, OUTCOMES, REFUSED
 from optid.studies.storage.store import LABELS, Store
 from optid.studies.trial import check_data
 
@@ -52,9 +51,7 @@ def run(study: Definition, db: str | Path, *, workers: int | None = None, execut
         DatabaseError: another run is writing to the database, it is of another schema version, or it cannot be written
             (what is finished is kept then, and the next run goes on from there).
     """
-    retry = _checked(retry)
-    check_data(study)
-    grid = cells(study)
+    retry, grid = _checked(study, retry)
     if workers is not None and executor is not None:
         raise StudyError("workers are processes of this machine, an executor has its own: leave one of them out")
     if executor is None:
@@ -64,7 +61,7 @@ def run(study: Definition, db: str | Path, *, workers: int | None = None, execut
     with Store(db, write=True) as store, store.claim(study.name):
         todo = _prepared(store, study, grid, accept_changed_data, retry)
         store.describe(study.name, _description(study))
-        _work(todo, len(grid), execute, store, progress)
+        _work(todo, len(grid), execute, store, progress or (lambda *_: None))
         return store.rows_of(study.name, [cell.identity for cell in grid])
 
 
@@ -77,9 +74,7 @@ def plan(study: Definition, db: str | Path, *, accept_changed_data: bool = False
     Returns:
         All cells, those that a run would run, and a text on the rows that it would set aside.
     """
-    retry = _checked(retry)
-    check_data(study)
-    grid = cells(study)
+    retry, grid = _checked(study, retry)
     if not Path(db).exists():
         return grid, grid, ""
     with Store(db) as store, store.copy() as copy:
@@ -103,12 +98,14 @@ def describe_previous_run(store: Store, study: Definition) -> str:
     return f"{total:,} {'row is' if total == 1 else 'rows are'} set aside: {'; '.join(reasons)}" if total else ""
 
 
-def _checked(retry: str | Sequence[str]) -> Sequence[str]:
+def _checked(study: Definition, retry: str | Sequence[str]) -> tuple[Sequence[str], list[Cell]]:
+    """Return the outcomes to retry, and the cells of a study whose data can be read."""
     retry = (retry,) if isinstance(retry, str) else retry
     for outcome in retry:
         if outcome not in OUTCOMES:
             raise StudyError(f"no outcome is called {outcome!r}. {nearest(outcome, OUTCOMES)}")
-    return retry
+    check_data(study)
+    return retry, cells(study)
 
 
 def _prepared(store: Store, study: Definition, grid: list[Cell], accept_changed_data: bool, retry: Sequence[str]
@@ -123,27 +120,9 @@ def _prepared(store: Store, study: Definition, grid: list[Cell], accept_changed_
     return [cell for cell in grid if cell.identity not in done]
 
 
-def run_to_frame(study: Definition, db: str | Path | None = None, **settings: Any) -> Any:
-    """Run a study, by default in a temporary database; return a pandas frame, or dicts where pandas is missing."""
-    with tempfile.TemporaryDirectory() as folder:
-        rows = run(study, db or Path(folder) / "study.sqlite", **settings)
-    try:
-        import pandas as pd
-    except ImportError:
-        return rows
-    kinds = {"number": "float64", "integer": "Int64", "flag": "boolean"}
-    frame = pd.DataFrame(rows, columns=list(NAMES))
-    frame = frame.astype({c.name: "bool" if c.kind == "flag" and c.always else kinds[c.kind]
-                          for c in COLUMNS if c.kind in kinds})
-    frame["started"] = pd.to_datetime(frame["started"], utc=True)
-    return frame
-
-
-def _work(todo: list[Cell], total: int, execute: Execution, store: Store, progress: Progress | None) -> None:
-    done = total - len(todo)
-    if progress is not None:
-        progress(done, total, None)
-    expected = {cell.identity for cell in todo}
+def _work(todo: list[Cell], total: int, execute: Execution, store: Store, progress: Progress) -> None:
+    done, expected = total - len(todo), {cell.identity for cell in todo}
+    progress(done, total, None)
     with closing(_all_rows(todo, execute)) as rows:
         for row in rows:
             identity = (row["key"], row["repetition"])
@@ -156,21 +135,19 @@ def _work(todo: list[Cell], total: int, execute: Execution, store: Store, progre
                                     "space; the same run resumes from there") from error
             expected.remove(identity)
             done += 1
-            if progress is not None:
-                progress(done, total, row)
+            progress(done, total, row)
     if expected:
         raise StudyError(f"{len(expected)} cells of {total} returned no row; run the study again")
 
 
 def _all_rows(todo: Sequence[Cell], execute: Execution) -> Generator[Row, None, None]:
-    """Yield the rows of refused cells, then those of the others."""
     yield from (lost_row(cell, REFUSED, cell.refusal) for cell in todo if cell.refusal)
     yield from execute([cell for cell in todo if not cell.refusal])
 
 
 def _description(study: Definition) -> str:
     try:
-        return as_toml(replace(study, data=tuple(with_absolute_paths(entry, study.folder) for entry in study.data)))
+        return replace(study, data=tuple(with_absolute_paths(entry, study.folder) for entry in study.data)).to_toml()
     except StudyError:  # records in memory, and other values that TOML does not hold, have no text
         return ""
 

@@ -34,12 +34,18 @@ STATUSES = tuple(str(status) for status in Status)  # every value of the column 
 SUCCESS = (str(Status.OPTIMAL), str(Status.LOCAL))  # those with which the requested accuracy was reached
 
 
+KINDS: Mapping[str, tuple[str, type, str]] = {
+    "text": ("TEXT", str, ""), "json": ("TEXT", str, " (JSON)"), "number": ("REAL", float, ""),
+    "integer": ("INTEGER", int, ""), "flag": ("INTEGER", bool, " (flag)"), "time": ("TEXT", str, " (time)")}
+"""Kinds of columns: type in the database, type in a row, and a note on it. A time is UTC, as ISO 8601."""
+
+
 @dataclass(frozen=True)
 class Column:
     """One column."""
 
     name: str
-    kind: str  # "text", "json" (text that parses), "number", "integer", "flag" or "time" (UTC, ISO 8601 in a row)
+    kind: str  # of `KINDS`
     meaning: str  # one sentence for people
     unit: str = ""  # of its numbers
     always: bool = False  # whether every row has a value
@@ -47,7 +53,7 @@ class Column:
     @property
     def sql(self) -> str:
         """Its type in the database."""
-        return {"number": "REAL", "integer": "INTEGER", "flag": "INTEGER"}.get(self.kind, "TEXT")
+        return KINDS[self.kind][0]
 
 
 COLUMNS: tuple[Column, ...] = (
@@ -147,9 +153,6 @@ LONGEST_LABEL = 80  # characters of the labels of data, formulations and solvers
 REQUIRED = ("data", "formulation", "solver", "outcome", "status_verified", "objective", "solve_s")
 """Columns that rows must have."""
 
-_TYPES: Mapping[str, tuple[type, ...]] = {"text": (str,), "json": (str,), "number": (float, int), "integer": (int,),
-                                          "flag": (bool,), "time": (str,)}
-
 
 def complete(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return a complete row in the order of the columns; missing values are None, or False for a flag in every row.
@@ -172,26 +175,24 @@ def complete(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _cell_value(column: Column, value: Any) -> Any:
-    value = value.item() if hasattr(value, "item") else value
-    if value is None and column.always and column.kind == "flag":
-        return False
-    if column.kind == "number" and isinstance(value, int) and abs(value) > sys.float_info.max:
-        value = math.inf
-    if column.kind in ("number", "integer") and isinstance(value, float) and not math.isfinite(value):
+    value, wanted = value.item() if hasattr(value, "item") else value, KINDS[column.kind][1]
+    if wanted is float and type(value) is int:
+        value = float(value) if abs(value) <= sys.float_info.max else None
+    if wanted in (float, int) and isinstance(value, float) and not math.isfinite(value):
         value = None
-    if column.kind == "integer" and isinstance(value, float) and value.is_integer():
+    if wanted is int and isinstance(value, float) and value.is_integer():
         value = int(value)
-    if value is None:
-        if column.always:
-            raise ValueError(f"column {column.name!r} must have a value in every row")
-        return None
-    if isinstance(value, bool) != (column.kind == "flag") or not isinstance(value, _TYPES[column.kind]):
+    if value is None and column.always:
+        if wanted is bool:
+            return False
+        raise ValueError(f"column {column.name!r} must have a value in every row")
+    if value is not None and (not isinstance(value, wanted) or isinstance(value, bool) != (wanted is bool)):
         raise ValueError(f"column {column.name!r} holds a {column.kind}, not {value!r}")
-    if column.kind == "integer" and not -LARGEST <= value < LARGEST:
+    if wanted is int and value is not None and not -LARGEST <= value < LARGEST:
         raise ValueError(f"column {column.name!r} holds integers of 64 bits; this one is larger")
     if isinstance(value, str):  # messages of solvers may be no valid text
         return value.encode(errors="replace").decode().replace("\0", "")
-    return float(value) if column.kind == "number" else value
+    return value
 
 
 def as_json(value: Any) -> str:
@@ -232,7 +233,7 @@ def columns(rows: Any) -> dict[str, np.ndarray]:
         raise DataError(f"the rows have no column {', '.join(missing)}: this is not a table of study rows")
     table = {column.name: _array(column, given.get(column.name, [None] * n)) for column in COLUMNS}
     for name in ("data", "formulation", "solver"):
-        table[name] = _objects([_label(text) for text in table[name]])
+        table[name] = np.array([_label(text) for text in table[name]], dtype=object)
     return table
 
 
@@ -250,28 +251,16 @@ def _by_column(rows: Any) -> dict[str, Any]:
 
 
 def _array(column: Column, values: Any) -> np.ndarray:
+    missing = [v is None or isinstance(v, float) and v != v or type(v).__name__ in ("NAType", "NaTType")  # of pandas
+               for v in values]
     if column.kind in ("number", "integer"):
         try:
-            return np.array(values, dtype=float)  # None becomes NaN
-        except (TypeError, ValueError, OverflowError):
-            pass
-        try:
-            return np.array([np.nan if _is_empty(v) else float(v) for v in values])
+            return np.array([np.nan if empty else float(v) for empty, v in zip(missing, values)])
         except (TypeError, ValueError, OverflowError) as error:
             raise DataError(f"column {column.name!r} holds something that is not a number: {error}") from error
     if column.kind == "flag":
-        return np.array([not _is_empty(v) and bool(v) for v in values], dtype=bool)
-    return _objects(["" if _is_empty(v) else str(v) for v in values])
-
-
-def _objects(texts: list[str]) -> np.ndarray:
-    return np.array(texts, dtype=object)
-
-
-def _is_empty(value: Any) -> bool:
-    """Whether a value is None, NaN or the missing value of a frame."""
-    nan = isinstance(value, float) and value != value
-    return value is None or nan or type(value).__name__ in ("NAType", "NaTType")
+        return np.array([not empty and bool(v) for empty, v in zip(missing, values)], dtype=bool)
+    return np.array(["" if empty else str(v) for empty, v in zip(missing, values)], dtype=object)
 
 
 def _label(text: str) -> str:
@@ -279,9 +268,6 @@ def _label(text: str) -> str:
     if len(text) <= LONGEST_LABEL:
         return text or "(no name)"
     return f"{text[: LONGEST_LABEL - 8]}…{hashlib.sha256(text.encode(errors='replace')).hexdigest()[:6]}"
-
-
-_NOTES = {"json": " (JSON)", "flag": " (flag)", "time": " (time)"}
 
 
 def markdown() -> str:
@@ -311,7 +297,7 @@ In exported CSV files a text that a spreadsheet would run as a formula begins wi
 
 | column | type | unit | meaning |
 |---|---|---|---|"""]
-    lines += [f"| `{c.name}` | {c.sql}{_NOTES.get(c.kind, '')}{' NOT NULL' if c.always else ''} "
+    lines += [f"| `{c.name}` | {c.sql}{KINDS[c.kind][2]}{' NOT NULL' if c.always else ''} "
               f"| {c.unit} | {c.meaning} |" for c in COLUMNS]
     lines += ["", "| outcome | meaning |", "|---|---|", *(f"| {word} | {text} |" for word, text in OUTCOMES.items())]
     return "\n".join(lines) + "\n"

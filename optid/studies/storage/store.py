@@ -4,6 +4,7 @@ Every row is committed on arrival, so that a killed run loses only the cells bei
 and several processes may write. SQLite recovers an interrupted transaction by itself.
 """
 
+import json
 import os
 import platform
 import sqlite3
@@ -30,7 +31,6 @@ _STEPS = ", ".join(["study", "rows.key", "repetition", "data", "formulation", "r
     f"json_extract(step.value, '$.{name}') AS {alias}" for name, alias in (
         ("step", "step"), ("solver", "solver_used"), ("programs", "programs"), ("reached", "reached"),
         ("iterations", "iterations"), ("seconds", "seconds")))])
-_SAME = "study = ? AND key = ? AND repetition = ?"
 _OF_STUDY = "(:study IS NULL OR study = :study)"
 
 
@@ -121,15 +121,9 @@ class Store:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        with self._named("written"):
+        with self._named("written"), self._connection:  # which commits, or rolls back
             self._connection.execute("BEGIN IMMEDIATE")
-            try:
-                yield
-                self._connection.execute("COMMIT")
-            except BaseException:
-                if self._connection.in_transaction:
-                    self._connection.execute("ROLLBACK")
-                raise
+            yield
 
     def _all(self, statement: str, values: Mapping[str, Any] | Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         with self._named("read"):
@@ -152,9 +146,8 @@ class Store:
     def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Complete rows and write them in one transaction; they replace earlier rows of the same cells.
 
-        Raises:
-            DatabaseError: they cannot be written, as on a full disk; nothing is changed then.
-            ValueError: a row against the schema.
+        `DatabaseError` if they cannot be written, as on a full disk; `ValueError` for a row against the schema. Nothing
+        is changed then.
         """
         whole = [tuple(complete(row).values()) for row in rows]
         with self._transaction():
@@ -176,11 +169,10 @@ class Store:
 
         Without a study there is one row of each, "done" before others, then the newest.
         """
-        found: dict[tuple[str, int], Row] = {}
-        for values in self._all(f"SELECT {_LIST} FROM rows WHERE {_OF_STUDY} ORDER BY outcome = :done, started, study",
-                                {"study": study, "done": DONE}):
-            row: Row = {c.name: bool(v) if c.kind == "flag" and v is not None else v for c, v in zip(COLUMNS, values)}
-            found[row["key"], row["repetition"]] = row
+        rows = ({c.name: bool(v) if c.kind == "flag" and v is not None else v for c, v in zip(COLUMNS, values)}
+                for values in self._all(f"SELECT {_LIST} FROM rows WHERE {_OF_STUDY} "
+                                        "ORDER BY outcome = :done, started, study", {"study": study, "done": DONE}))
+        found = {(row["key"], row["repetition"]): row for row in rows}
         return [found[identity] for identity in identified if identity in found]
 
     def values(self, study: str | None = None) -> list[tuple[Any, ...]]:
@@ -226,24 +218,24 @@ class Store:
                                      "PRIMARY KEY (key, repetition))")
             self._connection.execute("DELETE FROM grid")
             self._connection.executemany("INSERT INTO grid VALUES (?, ?)", cells)
-            self._move_aside(asked.format("NOT IN"), [study])
+            self._move("rows", "superseded", asked.format("NOT IN"), [study])
             back = self._connection.execute(
                 f"SELECT key, repetition, max(started) FROM superseded WHERE {asked.format('IN')} AND (key, repetition)"
                 " NOT IN (SELECT key, repetition FROM rows WHERE study = ?) GROUP BY key, repetition",
                 [study, study]).fetchall()
             for row in back:
-                self._connection.execute(f"INSERT OR REPLACE INTO rows ({_LIST}) SELECT {_LIST} FROM superseded WHERE "
-                                         f"{_SAME} AND started = ?", [study, *row])
-                self._connection.execute(f"DELETE FROM superseded WHERE {_SAME} AND started = ?", [study, *row])
+                self._move("superseded", "rows", "study = ? AND key = ? AND repetition = ? AND started = ?",
+                           [study, *row])
 
     def set_aside(self, study: str, outcomes: Sequence[str]) -> None:
         """Move the rows of a study with these outcomes to the table ``superseded``, so that their cells run again."""
         with self._transaction():
-            self._move_aside(f"study = ? AND outcome IN ({_marks(outcomes)})", [study, *outcomes])
+            self._move("rows", "superseded", f"study = ? AND outcome IN ({_marks(outcomes)})", [study, *outcomes])
 
-    def _move_aside(self, chosen: str, values: Sequence[str]) -> None:
-        self._connection.execute(f"INSERT INTO superseded ({_LIST}) SELECT {_LIST} FROM rows WHERE {chosen}", values)
-        self._connection.execute(f"DELETE FROM rows WHERE {chosen}", values)
+    def _move(self, source: str, target: str, chosen: str, values: Sequence[str]) -> None:
+        self._connection.execute(f"INSERT OR REPLACE INTO {target} ({_LIST}) SELECT {_LIST} FROM {source} "
+                                 f"WHERE {chosen}", values)
+        self._connection.execute(f"DELETE FROM {source} WHERE {chosen}", values)
 
     def count_superseded(self, study: str | None = None) -> dict[tuple[str, str, str], int]:
         """Return {(data, formulation, solver): rows set aside}: kept, but in no report."""
@@ -262,11 +254,9 @@ class Store:
 
     def data_hashes(self) -> dict[tuple[str, str], set[str]]:
         """Return {(study, data label): hashes of the data files behind the rows}; simulated data have none."""
-        hashes: dict[tuple[str, str], set[str]] = {}
-        for study, data, value in self._all("SELECT DISTINCT study, data, data_hash FROM rows "
-                                            "WHERE data_hash IS NOT NULL"):
-            hashes.setdefault((study, data), set()).add(value)
-        return hashes
+        found = self._all("SELECT study, data, json_group_array(DISTINCT data_hash) FROM rows "
+                          "WHERE data_hash IS NOT NULL GROUP BY study, data")
+        return {(study, data): set(json.loads(hashes)) for study, data, hashes in found}
 
 
 def _check_kind(path: Path) -> None:
@@ -327,36 +317,19 @@ def _marks(values: Sequence[Any]) -> str:
     return ", ".join("?" * len(values))
 
 
-def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Append rows to a database, which is made when it is not there; see `Store.append`."""
-    with Store(path, write=True) as store:
-        store.append(rows)
-
-
-def read_rows(path: str | Path, study: str | None = None) -> dict[str, np.ndarray]:
+def read_rows(path: str | Path) -> dict[str, np.ndarray]:
     """Return the rows of a database as `rows.columns` does, sorted by the moments their cells started.
 
-    These are datetime64[us], and repetitions int64. A run may be writing to the database.
-
-    Raises:
-        DatabaseError: as for `Store`.
+    These are datetime64[us], and repetitions int64. A run may be writing to the database. `DatabaseError` as `Store`.
     """
     with Store(path) as store:
-        values = dict(zip(NAMES, zip(*store.values(study))))
+        values = dict(zip(NAMES, zip(*store.values())))
     try:
         starts = [text.partition("+")[0] for text in values.get("started", ())]
         return columns(values) | {"started": np.array(starts, dtype="datetime64[us]"),
                                   "repetition": np.array(values.get("repetition", ()), dtype=np.int64)}
     except (DataError, AttributeError, TypeError, ValueError, OverflowError) as error:
         raise DatabaseError(f"{path} holds invalid values ({error}): use another copy") from None
-
-
-def finished_rows(path: str | Path, study: str | None = None) -> set[tuple[str, int]]:
-    """Return (key, repetition) of every row of a database, or of one study; empty where there is no database yet."""
-    if not Path(path).exists():
-        return set()
-    with Store(path) as store:
-        return store.finished_rows(study)
 
 
 def rows_of_one(path: str | Path, study: str | None = None) -> Any:

@@ -1,1 +1,1 @@
-"""From rows to a verdict: profiles, averages, ranks, growth, agreement, and advice in words."""
+"""From rows to a verdict: tables of accuracy and time, profiles, paired intervals, and one headline."""

@@ -38,6 +38,11 @@ class Paired:
     ratio: bool = False  # whether these are ratios, whose equals are at 1, or differences, whose equals are at 0
 
     @property
+    def texts(self) -> tuple[str, ...]:
+        """Value and interval as texts."""
+        return tuple(f"{v + 0.0:{'.3g' if self.ratio else '.2f'}}" for v in (self.value, self.low, self.high))
+
+    @property
     def enough(self) -> bool:
         """Whether there are enough common problems for a conclusion."""
         return self.n >= MINIMUM_PAIRS
@@ -45,27 +50,18 @@ class Paired:
     @property
     def notable(self) -> bool:
         """Whether the estimate is worse by more than `MINOR`, significant or not."""
-        return self.value > self._around(MINOR)[1]
+        return self.value > self.ratio + MINOR
 
     @property
     def behind(self) -> bool:
         """Whether it is significantly worse, and by more than `MINOR`."""
-        return self.enough and self.low > self._around(0.0)[1] and self.notable
-
-    @property
-    def ahead(self) -> bool:
-        """Whether it is significantly better, and by more than `MINOR`."""
-        return self.enough and self.high < self._around(0.0)[0] and self.value < self._around(MINOR)[0]
+        return self.enough and self.low > self.ratio and self.notable
 
     @property
     def vague(self) -> bool:
         """Whether the interval contains differences `VAGUE` times `MINOR`: too wide for a tie."""
-        low, high = self._around(VAGUE * MINOR)
-        return self.low < low or self.high > high
-
-    def _around(self, slack: float) -> tuple[float, float]:
-        """Return the bounds of values this close to equality."""
-        return (1 / (1 + slack), 1 + slack) if self.ratio else (-slack, slack)
+        slack = VAGUE * MINOR
+        return self.low < (1 / (1 + slack) if self.ratio else -slack) or self.high > self.ratio + slack
 
 
 def paired_mean(values: np.ndarray, reference: np.ndarray, ratio: bool = True,
@@ -103,19 +99,6 @@ def sign_test(lost: int, won: int) -> float:
     return float(binomtest(lost, lost + won, alternative="greater").pvalue) if lost + won else 1.0
 
 
-@dataclass(frozen=True)
-class PerformanceProfile:
-    """The share of problems solved within a factor of the fastest time: a right-continuous step function."""
-
-    factors: np.ndarray  # where it steps, ascending, the first at least 1
-    shares: np.ndarray  # its value from there on, in (0, 1]
-
-    def __call__(self, factor: float) -> float:
-        """Return the share of problems solved within this factor of the fastest time."""
-        at = int(np.searchsorted(self.factors, factor, side="right"))
-        return float(self.shares[at - 1]) if at else 0.0
-
-
 def time_ratios(times: np.ndarray) -> np.ndarray:
     """Return every time relative to the fastest on its problem; (P, S), ``nan`` where not solved becomes ``inf``."""
     reached = np.where(np.isfinite(times), times, np.inf)
@@ -123,10 +106,14 @@ def time_ratios(times: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(reached), reached / np.where(np.isfinite(fastest), fastest, 1.0), np.inf)
 
 
-def performance_profiles(times: np.ndarray) -> list[PerformanceProfile]:
-    """Return a profile per solver for times (P, S), ``nan`` where not solved; unsolved problems count in the shares."""
+def performance_profiles(times: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return a profile per solver for times (P, S), ``nan`` where not solved: a right-continuous step function.
+
+    It has the factors of the fastest time at which it steps, ascending from 1, and the shares of all P problems that
+    are solved within them.
+    """
     profiles = []
     for ratios in time_ratios(times).T:
         factors, counts = np.unique(ratios[np.isfinite(ratios)], return_counts=True)
-        profiles.append(PerformanceProfile(factors, np.cumsum(counts) / max(len(ratios), 1)))
+        profiles.append((factors, np.cumsum(counts) / max(len(ratios), 1)))
     return profiles

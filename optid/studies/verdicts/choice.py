@@ -1,7 +1,7 @@
 """The choice of the best: reliability before speed, with ties and undecided comparisons."""
 
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import permutations
 
 import numpy as np
 
@@ -74,10 +74,7 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
     reliable = [int(s) for s in np.flatnonzero(counts)
                 if lost[s] - won[s] <= allowed or sign_test(int(lost[s]), int(won[s])) >= LEVEL]
     candidates = tuple(names[s] for s in reliable)
-    beaten = set()
-    for one, other in combinations(reliable, 2):
-        pair = compare(costs[:, one], costs[:, other])
-        beaten |= {one} if pair.behind else {other} if pair.ahead else set()
+    beaten = {one for one, other in permutations(reliable, 2) if compare(costs[:, one], costs[:, other]).behind}
     unbeaten = [s for s in reliable if s not in beaten]
     leaders = [s for s in unbeaten if counts[s] >= max(counts[unbeaten]) - allowed]
     common = known[:, leaders].all(axis=1)

@@ -10,8 +10,8 @@ from optid.errors import DataError
 from optid.phrases import seconds
 from optid.studies.storage.rows import ERROR, REFUSED, columns
 from optid.studies.verdicts.averages import MINOR
-from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, tabulate
-from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, group_words, join_names
+from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, seconds_of, tabulate
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, group, join_names
 from optid.studies.verdicts.verdict import StudyVerdict, conclude
 
 
@@ -43,7 +43,7 @@ class SolverComparison:
     @property
     def reasons(self) -> dict[str, list[str]]:
         """Solvers that did not solve it, by reason."""
-        return group_words((line.reason, line.solver) for line in self.lines if line.state != SOLVED and line.reason)
+        return group((line.reason, line.solver) for line in self.lines if line.state != SOLVED and line.reason)
 
     @property
     def common_error(self) -> str | None:
@@ -58,10 +58,10 @@ class SolverComparison:
         """Which solver to use on this record, with the evidence."""
         solved = [line for line in self.lines if line.state == SOLVED]
         at = f"the accuracy of {self.accuracy:.0e}"
-        if not solved and not self.lines:
+        if not self.lines:
             return Statement(FAIR, "No solver takes this formulation", "choose others (optid solvers).")
         if not solved:
-            states = group_words((line.state, line.solver) for line in self.lines)
+            states = group((line.state, line.solver) for line in self.lines)
             why = "; ".join(f"{state}: {join_names(names)}" for state, names in states.items())
             return Statement(BAD, f"No solver reached {at}", f"{counting(self.accuracy)}; {why}.")
         first, *others = solved
@@ -71,11 +71,11 @@ class SolverComparison:
         text = f"{'they' if close else 'it'} reached {at} ({counting(self.accuracy)}) in {seconds(first.cold)}"
         text += f", equal within {MINOR:.0%}" if close else ""
         text += f", {'' if first.proved else 'not '}proved globally optimal"
+        failed = [line.solver for line in self.lines if line.state != SOLVED]
         if rest:
             text += f"; next is {rest[0].solver} with {seconds(rest[0].cold)}"
             text += " (without a proof)" if first.proved and not rest[0].proved else ""
         elif not others:
-            failed = [line.solver for line in self.lines if line is not first]
             text += f"; {join_names(failed)} did not" if failed else "; there is no other to compare it with"
         either = " or ".join(names) if len(names) < 4 else f"any of {join_names(names)}"
         return Statement(GOOD, f"Use {either}", f"{text}.")
@@ -97,6 +97,8 @@ def compare(rows: Sequence[dict[str, Any]]) -> SolverComparison:
     table = columns(rows)
     found = tabulate(table)
     best = np.min(found.objective[0][found.solved[0]], initial=np.inf)
+    excess = (table["objective"] - (best if np.isfinite(best) else np.nan)) / found.size[0]
+    cold = seconds_of(table, "solve")
     lines, refused = [], {}
     for solver, state, row, residual in zip(found.solvers, found.state[0], found.row[0], found.residual[0]):
         shown = {name: values[row] for name, values in table.items()}
@@ -104,12 +106,10 @@ def compare(rows: Sequence[dict[str, Any]]) -> SolverComparison:
             refused[solver] = str(shown["reason"])
             continue
         mine = (table["solver"] == solver) & (table["outcome"] == shown["outcome"])
-        cold = np.nan_to_num(table["compile_s"][mine]) + table["solve_s"][mine]
         lines.append(Line(
             solver, str(state), str(shown["status_verified"] or shown["outcome"]), bool(shown["proved"]),
-            float((shown["objective"] - best) / found.size[0] if np.isfinite(best) else np.nan), float(residual),
-            _median(cold), _median(table["warm_s"][mine]), float(shown["one_step_fit"]),
-            float(shown["simulation_fit"]), str(shown["reason"])))
+            float(excess[row]), float(residual), _median(cold[mine]), _median(table["warm_s"][mine]),
+            float(shown["one_step_fit"]), float(shown["simulation_fit"]), str(shown["reason"])))
     return SolverComparison(tuple(sorted(lines, key=_order)), refused, float(table["accuracy"][0]))
 
 
@@ -123,8 +123,7 @@ def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> StudyVerdict:
 
 
 def _order(line: Line) -> tuple[Any, ...]:
-    states = (SOLVED, WORSE_MINIMUM)
-    rank = states.index(line.state) if line.state in states else len(states) + (line.state == FALSE_CLAIM)
+    rank = {SOLVED: 0, WORSE_MINIMUM: 1, FALSE_CLAIM: 3}.get(line.state, 2)
     return rank, not line.proved, np.nan_to_num(line.cold, nan=np.inf), line.solver
 
 

@@ -2,9 +2,9 @@
 
 from collections import Counter
 
-from optid.phrases import plural, seconds
+from optid.phrases import plural
 from optid.studies.verdicts.averages import Paired
-from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, ONLY_ONE, TIE, Choice
+from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, ONLY_ONE, TIE
 from optid.studies.verdicts.models import DataSet, Quality
 from optid.studies.verdicts.outcomes import Results
 from optid.studies.verdicts.standings import Standing, StandingsSection
@@ -17,45 +17,35 @@ LISTED = 4  # data sets in a sentence
 
 def headline(overall: StandingsSection, sections: tuple[StandingsSection, ...], models: Quality) -> Statement:
     """Return the verdict in one line, about what differs: the solvers, or else the formulations by their models."""
-    if not len(overall.found.data) or not overall.standings:
-        return solver_statement(overall)
+    problems, best = len(overall.found.data), overall.choice
     several = [section for section in sections if len(section.standings) > 1]
-    if not several:
+    if problems and overall.standings and not several:
         return model_statement(models) or solver_statement(overall)
-    best = overall.choice
-    beaten = any(s.choice.decided and not {*best.leaders} <= {*s.choice.leaders} for s in several)
-    everywhere = best.decided and overall.standing(best.first).solved >= 0.99 * len(overall.found.data) and not beaten
     decided = [section for section in several if section.recommended]
+    beaten = any(s.choice.decided and not {*best.leaders} <= {*s.choice.leaders} for s in several)
+    everywhere = best.decided and overall.standing(best.first).solved >= 0.99 * problems and not beaten
     if len(sections) < 2 or everywhere or not decided:
         return solver_statement(overall)
-    leaders = _leaders(overall, decided)
+    leaders, rest = dict[str, list[StandingsSection]](), decided
+    while rest:  # few solvers that lead all of them, the one that leads most first
+        leads = {s.solver: [one for one in rest if s.solver in one.choice.leaders] for s in overall.standings}
+        name = max(leads, key=lambda solver: len(leads[solver]))
+        leaders[name] = leads[name]
+        rest = [one for one in rest if one not in leads[name]]
     word = "; ".join(f"{name} for {join_names([one.name for one in theirs])}" for name, theirs in leaders.items())
     if len(leaders) == 1 and len(decided) == len(sections):
         word = f"Use {next(iter(leaders))}"
     most = max(overall.standings, key=lambda s: (s.solved, s.solver))
-    text = f"{describe_comparison(overall.found)}. "
-    text += f"{most.solver} solved most, {of(most.solved, len(overall.found.data))}."
-    if len(decided) < len(several):
-        undecided = len(several) - len(decided)
+    text = f"{describe_comparison(overall.found)}. {most.solver} solved most, {of(most.solved, problems)}."
+    if undecided := len(several) - len(decided):
         text += f" For {undecided} of {plural(len(several), 'formulation')} the comparison cannot tell."
-    if len(several) < len(sections):
-        text += f" {plural(len(sections) - len(several), 'formulation')} had a single solver, so nothing to compare."
+    if alone := len(sections) - len(several):
+        text += f" {plural(alone, 'formulation')} had a single solver, so nothing to compare."
     tones = [_tone(one.standing(name), len(one.found.data)) for name, theirs in leaders.items() for one in theirs]
-    tone = max(tones + [FAIR] * (len(decided) < len(several)), key=(GOOD, FAIR, BAD).index)
+    tone = max(tones + [FAIR] * bool(undecided), key=(GOOD, FAIR, BAD).index)
     if len(word) > LONGEST:
         return Statement(tone, "It depends on the formulation", f"{word}. {text}")
     return Statement(tone, word, text)
-
-
-def _leaders(overall: StandingsSection, decided: list[StandingsSection]) -> dict[str, list[StandingsSection]]:
-    """Return few solvers that lead all these sections, {solver: sections}; the one that leads most comes first."""
-    order, rest, found = [s.solver for s in overall.standings], list(decided), {}
-    while rest:
-        leads = {name: [one for one in rest if name in one.choice.leaders] for name in order}
-        name = max(leads, key=lambda solver: len(leads[solver]))
-        found[name] = leads[name]
-        rest = [one for one in rest if one not in leads[name]]
-    return found
 
 
 def describe_comparison(found: Results) -> str:
@@ -87,9 +77,7 @@ def solver_statement(section: StandingsSection) -> Statement:
     if not choice.first:
         return Statement(FAIR, "Cannot tell", f"{text}{evidence(section)}.")
     lead = section.standing(choice.first)
-    text += f"{lead.solver} solved {of(lead.solved, n)}"
-    text += f" in {seconds(lead.time)} on average" if lead.time == lead.time else ""
-    text += f"; {evidence(section)}."
+    text += f"{lead.solver} solved {of(lead.solved, n)}; {evidence(section)}."
     if lead.false_claims:
         text += f" Claims of {lead.solver} were false on {plural(lead.false_claims, 'problem')}."
     if choice.kind == CANNOT_TELL:
@@ -106,27 +94,24 @@ def solver_statement(section: StandingsSection) -> Statement:
 
 def evidence(section: StandingsSection) -> str:
     """Give the evidence for a choice: the distance of the next from the first, or the missing data."""
-    choice, first = section.choice, section.choice.first
+    choice = section.choice
     if choice.kind == ONLY_ONE:
         return "there is nothing to compare it with"
     if not choice.decided:
         return f"the comparison {choice.missing}"
-    rivals = {name: pair.value for name, pair in choice.against.items() if name in (choice.tied or choice.candidates)}
-    if not rivals:
-        rivals = {name: -choice.solved[name] for name in choice.against}
-    if not rivals:
+    if not choice.against:
         return "no other solved any problem"
-    name = min(rivals, key=lambda rival: rivals[rival])
+    near = {name: pair.value for name, pair in choice.against.items() if name in (choice.tied or choice.candidates)}
+    name = min(near, key=near.__getitem__) if near else max(choice.against, key=choice.solved.__getitem__)
     pair, said = choice.against[name], f"the next, {name}, solved {choice.solved[name]:,}"
     if choice.kind == TIE:
-        said = f"{name} does not differ from {first} beyond chance or 10 %: it solved {choice.solved[name]:,}"
+        said = f"{name} does not differ from {choice.first} beyond chance or 10 %: it solved {choice.solved[name]:,}"
     return f"{said} and takes {interval(pair, ' times the time')}" if pair.n else said
 
 
 def interval(pair: Paired, unit: str = "", noun: str = "problem") -> str:
     """Write a paired comparison with its 95 % interval: "1.5 times the time (95 %: 1.2 to 1.9, 18 problems)"."""
-    digits = ".3g" if pair.ratio else ".2f"
-    value, low, high = (f"{v + 0.0:{digits}}" for v in (pair.value, pair.low, pair.high))
+    value, low, high = pair.texts
     return f"{value}{unit} (95 %: {low} to {high}, {plural(pair.n, noun)})" if pair.n > 1 else f"{value}{unit}"
 
 
@@ -149,15 +134,16 @@ def model_statement(models: Quality) -> Statement | None:
     if choice.kind == NOBODY:
         return Statement(FAIR, unknown, f"{text}: none has one. Keep a hold-out share, or simulate a known truth.")
     if choice.kind == DEPENDS:
-        each = "; ".join(_best_of(models, one) for one in models.sets[:LISTED])
+        each = "; ".join(_best_of(one) for one in models.sets[:LISTED])
         return Statement(FAIR, "Models depend on the data", f"{text}: {each}.")
     if not choice.first:
         return Statement(FAIR, unknown, f"{text}: the comparison {choice.missing}.")
-    text += f": {choice.first} has a mean of {figure(models, models, choice.first)}"
+    text += f": {choice.first}"
     rivals = {name: choice.against[name] for name in (choice.tied or choice.candidates) if name in choice.against}
     if rivals:
-        name = min(rivals, key=lambda rival: rivals[rival].value)
-        text += f"; the next, {name}, {distance(models, choice, name)}"
+        name, pair = min(rivals.items(), key=lambda rival: rival[1].value)
+        text += f"; the next, {name}, " + (f"has {interval(pair, ' times the error', models.unit)}" if models.errors
+                                           else f"is behind by {interval(pair, ' points', models.unit)}")
     if choice.kind == CANNOT_TELL:
         return Statement(FAIR, unknown, f"{text}; the comparison {choice.missing}.")
     if not rivals:
@@ -166,22 +152,9 @@ def model_statement(models: Quality) -> Statement | None:
     return Statement(GOOD, word, f"{text}.")
 
 
-def figure(models: Quality, some: DataSet, name: str) -> str:
-    """Write the mean by which formulations are compared."""
-    mean = some.figures[models.measure][name]
-    return "-" if mean != mean else f"{100 * mean:.3g} %" if models.errors else f"{mean:.2f} %"
-
-
-def distance(models: Quality, choice: Choice, name: str, unit: str = "") -> str:
-    """State how far the models of a formulation are behind the best, with the 95 % interval."""
-    pair, unit = choice.against[name], unit or models.unit
-    return f"has {interval(pair, ' times the error', unit)}" if models.errors else \
-        f"is behind by {interval(pair, ' points', unit)}"
-
-
-def _best_of(models: Quality, one: DataSet) -> str:
+def _best_of(one: DataSet) -> str:
     if not one.choice.first:
         return f"on {one.name} the comparison {one.choice.missing}"
     so_far = " so far" if one.choice.kind == CANNOT_TELL else ""
     best = join_names(one.choice.leaders) if one.choice.kind == TIE else one.choice.first
-    return f"on {one.name} {best}{so_far}, {figure(models, one, one.choice.first)} ({plural(one.records, 'record')})"
+    return f"on {one.name} {best}{so_far} ({plural(one.records, 'record')})"

@@ -119,8 +119,9 @@ def _of_few(sets: tuple[DataSet, ...], choice: Choice, losses: np.ndarray, names
     lead = losses[:, names.index(first)]
     against = {name: paired_mean(loss, lead, errors, data) for name, loss in zip(names, losses.T)
                if name != first and choice.solved[name]}
-    tied = tuple(name for name in leaders if name != first)
+    tied, kind, missing = tuple(name for name in leaders if name != first), FIRST, ""
     if len(decided) < len(sets):
-        return replace(choice, kind=CANNOT_TELL, first=first, tied=tied, against=against,
-                       missing=f"needs at least {FEW} data sets, or {FEW} records of each")
-    return replace(choice, kind=TIE if tied else FIRST, first=first, tied=tied, against=against, missing="")
+        kind, missing = CANNOT_TELL, f"needs at least {FEW} data sets, or {FEW} records of each"
+    elif tied:
+        kind = TIE
+    return replace(choice, kind=kind, first=first, tied=tied, against=against, missing=missing)

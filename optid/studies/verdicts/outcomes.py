@@ -20,6 +20,7 @@ from optid.studies.storage.rows import (
     SUCCESS,
     TIME_LIMIT,
 )
+from optid.studies.verdicts.statement import group
 
 SOLVED, NOT_RUN = "solved", "not run"
 FALSE_CLAIM, CONTRADICTED, INFEASIBLE = "false claim", "contradicted", str(Status.INFEASIBLE)
@@ -68,7 +69,6 @@ class Results:
     reason: np.ndarray  # sentence of the first run that did not solve it, (P, S)
     false: np.ndarray  # whether a claim was false, of any repetition at any accuracy, or contradicted, (P, S)
     time: np.ndarray  # median over the repetitions in seconds, (P, S); nan unless solved
-    fit: np.ndarray  # median over the repetitions of the whole fit in seconds, (P, S); nan unless solved
     proved: np.ndarray  # whether every repetition was proved globally optimal, (P, S)
     objective: np.ndarray  # (P, S), where the verified accuracy was reached, local minima included; nan otherwise
     size: np.ndarray  # yardstick of differences of objectives, (P,)
@@ -111,20 +111,11 @@ class Results:
 
 
 def tabulate(table: Table, accuracy: float | None = None, time: str = "solve") -> Results:
-    """Sort rows into problems and solvers, and decide which entries are solved.
+    """Sort rows, as of `rows.columns`, into problems and solvers; arguments and errors are those of `conclude`.
 
-    Args:
-        table: as returned by `optid.studies.storage.rows.columns`.
-        accuracy: relative accuracy to compare at; by default the one most runs asked for.
-        time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
-
-    Returns:
-        The table. An entry is solved where every repetition was completed and verified, has residuals within the
-        tolerance of the common accuracy, the compared time, and an objective within `VALUE` of the best verified one.
-        Of runs at several requested accuracies those closest to the common one count.
-
-    Raises:
-        DataError: unknown measure of time.
+    An entry is solved where every repetition was completed and verified, has residuals within the tolerance of the
+    common accuracy, the compared time, and an objective within `VALUE` of the best verified one. Of runs at several
+    requested accuracies those closest to the common one count.
     """
     if time not in TIMES:
         raise DataError(f"time is one of {', '.join(TIMES)}, not {time!r}")
@@ -135,18 +126,16 @@ def tabulate(table: Table, accuracy: float | None = None, time: str = "solve") -
     states = _row_states(table, accuracy, time)
     verified = np.isin(states, VERIFIED)
     problem, solver, solvers = _places(table)
-    entries: dict[tuple[int, int], list[int]] = {}
-    members: list[list[int]] = [[] for _ in range(int(problem.max(initial=-1)) + 1)]
-    for i in range(len(problem)):
-        members[problem[i]].append(i)
-        if states[i] != OTHER_ACCURACY:
-            entries.setdefault((problem[i], solver[i]), []).append(i)
-    shape = (len(members), len(solvers))
+    first = np.unique(problem, return_index=True)[1]  # row of every problem
+    scale = np.zeros(len(first))
+    np.maximum.at(scale, problem, np.nan_to_num(table["scale"], nan=0.0, posinf=0.0))
+    entries = group(((problem[i], solver[i]), i) for i in np.flatnonzero(states != OTHER_ACCURACY))
+    shape = (len(first), len(solvers))
     state, reason = np.full(shape, NOT_RUN, dtype=object), np.full(shape, "", dtype=object)
     false = np.zeros(shape, dtype=bool)
     np.logical_or.at(false, (problem, solver), table["false_claim"])
     row, proved = np.full(shape, -1), np.zeros(shape, dtype=bool)
-    numbers = {name: np.full(shape, np.nan) for name in ("time", "fit", "objective", "residual")}
+    numbers = {name: np.full(shape, np.nan) for name in ("time", "objective", "residual")}
     for at, runs in entries.items():
         runs.sort(key=lambda i: (table["repetition"][i], table["key"][i]))
         bad = next((i for i in runs if not verified[i]), next((i for i in runs if states[i] != SOLVED), None))
@@ -154,21 +143,19 @@ def tabulate(table: Table, accuracy: float | None = None, time: str = "solve") -
         state[at], reason[at] = states[row[at]], "" if bad is None else table["reason"][bad]
         numbers["residual"][at] = np.max(residual[runs])
         if bad is None:
-            numbers["time"][at], numbers["fit"][at] = np.median(seconds[runs]), np.median(table["fit_s"][runs])
+            numbers["time"][at] = np.median(seconds[runs])
             proved[at] = table["proved"][runs].all()
         if verified[runs].all():
             numbers["objective"][at] = np.max(table["objective"][runs])
-    first = np.array([m[0] for m in members], dtype=int)
     of_problem = {name: values[first] for name, values in table.items()}
     return _against_the_best(Results(
-        *(of_problem[name] for name in ("study", "data", "formulation")),
-        case=_numbered(of_problem, *_RECORD), size=np.array([_largest(table["scale"][m]) for m in members]),
-        solvers=solvers, state=state, reason=reason, false=false, row=row, proved=proved, accuracy=accuracy,
-        measure=time, **numbers))
+        *(of_problem[name] for name in ("study", "data", "formulation")), case=_numbered(of_problem, *_RECORD),
+        size=scale, solvers=solvers, state=state, reason=reason, false=false, row=row, proved=proved,
+        accuracy=accuracy, measure=time, **numbers))
 
 
 def _places(table: Table) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Number of the problem and of the solver of every row, and the solvers in alphabetical order."""
+    """Return the numbers of the problem and the solver of every row, and the solvers in alphabetical order."""
     solvers, solver = np.unique(table["solver"], return_inverse=True)
     return _numbered(table, *_RECORD, "formulation"), solver, tuple(solvers)
 
@@ -190,14 +177,9 @@ def _other_accuracy(table: Table, accuracy: float) -> np.ndarray:
     steps = np.log(np.where(np.isfinite(asked) & (asked > 0), asked, accuracy) / accuracy)
     distance = np.where(steps <= 0, -steps, steps + 1e6)
     problem, solver, solvers = _places(table)
-    entry = problem * len(solvers) + solver
-    nearest = np.full(int(entry.max(initial=-1)) + 1, np.inf)
-    np.minimum.at(nearest, entry, distance)
-    return distance > nearest[entry]
-
-
-def _largest(values: np.ndarray) -> float:
-    return float(np.max(values[np.isfinite(values)], initial=-np.inf)) if np.isfinite(values).any() else float("nan")
+    nearest = np.full((len(problem), len(solvers)), np.inf)
+    np.minimum.at(nearest, (problem, solver), distance)
+    return distance > nearest[problem, solver]
 
 
 def worst_residual(table: Table) -> np.ndarray:
@@ -228,10 +210,8 @@ def _row_states(table: Table, accuracy: float, time: str) -> np.ndarray:
         (warm_failed, WARM_FAILED),
         (~np.isfinite(seconds_of(table, time)), UNTIMED),
     ]
-    states = np.full(len(status), SOLVED, dtype=object)
-    for condition, word in reversed(choices):
-        states = np.where(condition, word, states)
-    return states.astype(object)
+    conditions, words = zip(*choices)
+    return np.select(conditions, words, SOLVED).astype(object)
 
 
 def _against_the_best(found: Results) -> Results:
@@ -239,14 +219,14 @@ def _against_the_best(found: Results) -> Results:
     verified = np.isfinite(found.objective)
     best = np.min(np.where(verified, found.objective, np.inf), axis=1, initial=np.inf)
     best = np.where(np.isfinite(best), best, 0.0)
-    size = np.maximum(np.maximum(np.abs(best), 1e-2 * np.nan_to_num(found.size)), np.finfo(float).tiny)
+    size = np.maximum(np.maximum(np.abs(best), 1e-2 * found.size), np.finfo(float).tiny)
     with np.errstate(invalid="ignore", over="ignore"):
         far = (found.objective - best[:, None]) / size[:, None] > max(VALUE, found.tolerance)
     worse = found.solved & far
     denied = np.isin(found.state, (INFEASIBLE, str(Status.UNBOUNDED))) & np.any(verified, axis=1, keepdims=True)
     state = np.where(worse, WORSE_MINIMUM, np.where(denied, CONTRADICTED, found.state)).astype(object)
     return replace(found, state=state, false=found.false | denied, proved=found.proved & ~worse, size=size,
-                   time=np.where(worse, np.nan, found.time), fit=np.where(worse, np.nan, found.fit))
+                   time=np.where(worse, np.nan, found.time))
 
 
 def states_of_rows(table: Table, found: Results) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The standing of every solver on a set of problems: all of a study, or those of one formulation."""
+"""The standing of every solver on a set of problems, all of a study or those of one formulation."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from optid.studies.storage.rows import REFUSED
-from optid.studies.verdicts.averages import PerformanceProfile, performance_profiles, shifted_geometric_mean
+from optid.studies.verdicts.averages import performance_profiles, shifted_geometric_mean
 from optid.studies.verdicts.choice import Choice, choose
 from optid.studies.verdicts.outcomes import INFEASIBLE, Results, agreed_infeasible
 
@@ -21,15 +21,9 @@ class Standing:
     refused: int  # problems it does not take
     false_claims: int  # problems on which a claim of it was false
     time: float  # shifted geometric mean of the seconds on what it solved; others may have solved other problems
-    fit: float  # the same of the whole fit; building, judging and proving take their time, too
     proved: int  # problems on which what it solved is proved globally optimal
     residual: float  # median verified residual on what it solved
     failures: dict[str, int]  # {why not solved: problems}, most frequent first
-
-    @property
-    def share(self) -> float:
-        """Solved share of the problems it was run on; ``nan`` where it was never run."""
-        return self.solved / self.problems if self.problems else float("nan")
 
 
 @dataclass(frozen=True)
@@ -42,13 +36,13 @@ class StandingsSection:
     standings: tuple[Standing, ...]  # of the solvers that were run, best first
     idle: tuple[str, ...]  # solvers that were run on none of these problems
     choice: Choice  # the best solver
-    profiles: dict[str, PerformanceProfile]  # performance profiles
+    profiles: dict[str, tuple[np.ndarray, np.ndarray]]  # performance profiles, as of `performance_profiles`
 
     @property
     def recommended(self) -> tuple[str, ...]:
         """The first and those that tie; empty where undecided, or where it fails more often than not."""
-        good = self.choice.decided and self.standing(self.choice.first).share >= 0.5
-        return self.choice.leaders if good else ()
+        lead = self.standing(self.choice.first) if self.choice.decided else None
+        return self.choice.leaders if lead is not None and 2 * lead.solved >= lead.problems else ()
 
     def standing(self, solver: str) -> Standing:
         """Return the standing of one solver."""
@@ -85,6 +79,6 @@ def _standing(found: Results, s: int, ran: np.ndarray) -> Standing:
     return Standing(
         solver=found.solvers[s], problems=int(ran.sum()), solved=int(solved.sum()),
         refused=int((state == REFUSED).sum()), false_claims=int(found.false[:, s].sum()),
-        time=shifted_geometric_mean(found.time[solved, s]), fit=shifted_geometric_mean(found.fit[solved, s]),
-        proved=int(found.proved[:, s].sum()), residual=float(np.median(residual)) if residual.size else float("nan"),
+        time=shifted_geometric_mean(found.time[solved, s]), proved=int(found.proved[:, s].sum()),
+        residual=float(np.median(residual)) if residual.size else float("nan"),
         failures={str(words[i]): int(counts[i]) for i in np.argsort(-counts, kind="stable")})

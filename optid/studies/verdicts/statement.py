@@ -8,6 +8,7 @@ from optid.phrases import plural
 from optid.program.solution import tolerance
 
 Key = TypeVar("Key")
+Member = TypeVar("Member")
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
 FINEST = tolerance(0.0) / 100  # requested accuracies below are judged as this one
@@ -22,11 +23,11 @@ class Statement:
     text: str  # why, with the numbers
 
 
-def group_words(pairs: Iterable[tuple[Key, str]]) -> dict[Key, list[str]]:
-    """Return {key: its words}, both in order of appearance."""
-    found: dict[Key, list[str]] = {}
-    for key, word in pairs:
-        found.setdefault(key, []).append(word)
+def group(pairs: Iterable[tuple[Key, Member]]) -> dict[Key, list[Member]]:
+    """Return {key: its members}, both in order of appearance."""
+    found: dict[Key, list[Member]] = {}
+    for key, member in pairs:
+        found.setdefault(key, []).append(member)
     return found
 
 

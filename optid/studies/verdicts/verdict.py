@@ -1,6 +1,7 @@
 """The verdict of a study: problems solved, times at equal verified accuracy, and undecided questions."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,10 @@ from optid.studies.verdicts.outcomes import (
     tabulate,
 )
 from optid.studies.verdicts.standings import StandingsSection, compare_solvers
-from optid.studies.verdicts.statement import BAD, FAIR, Statement, group_words, join_names
-from optid.studies.verdicts.steps import StepStanding, compare_steps
+from optid.studies.verdicts.statement import BAD, FAIR, Statement, group, join_names
+
+NUMBER = re.compile(r"(?<![A-Za-z_])[-+]?\d[\d.,]*(?:e[-+]?\d+)?")
+"""Left out of reasons, so that sentences of one kind count together."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,6 @@ class StudyVerdict:
     overall: StandingsSection  # comparison on all problems
     sections: tuple[StandingsSection, ...]  # comparison on the problems of each formulation, in alphabetical order
     models: Quality  # the formulations by their models
-    steps: tuple[StepStanding, ...]  # the solvers on the steps of procedures
     false_claims: tuple[FalseClaim, ...]  # most frequent first
     failures: tuple[Failure, ...]  # most frequent first, refusals at the end
     headline: Statement  # the verdict in one line
@@ -121,53 +123,44 @@ def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = No
     head = headline(overall, sections, models)
     about_models = model_statement(models)
     said = [] if about_models in (None, head) else [about_models]
-    return StudyVerdict(table, found, overall, sections, models, compare_steps(table), _false_claims(table, found),
-                        _failures(found), head, (*said, *_warnings(overall, found, table)))
+    return StudyVerdict(table, found, overall, sections, models, _false_claims(table, found), _failures(found),
+                        head, (*said, *_warnings(overall, found, table)))
 
 
-def _warnings(overall: StandingsSection, found: Results, table: Table) -> list[Statement]:
-    said = [_failed_data(found), _refuted(found, table)]
-    other = states_of_rows(table, found) == OTHER_ACCURACY
-    if other.any():
-        asked = ", ".join(f"{value:.0e}" for value in np.unique(table["accuracy"][other]))
-        said.append(Statement(FAIR, "Several accuracies", f"{plural(int(other.sum()), 'run')} asked for {asked}: they "
-                              f"do not count beside those that suit {found.accuracy:.0e}; --accuracy compares at "
-                              "another one."))
-    if k := overall.infeasible:
-        said.append(Statement(FAIR, "Infeasible problems", f"{plural(k, 'problem')} {'has' if k == 1 else 'have'} no "
-                              "solution according to every solver that came to an answer. This counts neither for nor "
-                              "against them."))
-    return [statement for statement in said if statement is not None]
-
-
-def _failed_data(found: Results) -> Statement | None:
-    """Name the data sets on which every run ended with an error, such as a file that cannot be read."""
+def _warnings(overall: StandingsSection, found: Results, table: Table) -> Iterator[Statement]:
     keys, error = found.data_set, found.state == ERROR
     failed = [key for key in sorted(set(keys)) if found.ran[keys == key].any()
               and (error | ~found.ran)[keys == key].all()]
-    if not failed:
-        return None
-    why = found.reason[(keys == failed[0])[:, None] & error][0]
-    text = f"Every run on {join_names([key.partition(chr(0))[2] for key in failed])} ended with an error: {why[:200]}"
-    return Statement(BAD, "Data that failed", text.rstrip(".") + ".")
+    if failed:  # such as a file that cannot be read
+        why = found.reason[(keys == failed[0])[:, None] & error][0]
+        names = join_names([key.partition(chr(0))[2] for key in failed])
+        text = f"Every run on {names} ended with an error: {why[:200]}"
+        yield Statement(BAD, "Data that failed", text.rstrip(".") + ".")
+    if (wrong := _refuted(found, table)).any():
+        p = int(np.flatnonzero(wrong)[0])
+        yield Statement(BAD, "A proof is contradicted", f"On {plural(int(wrong.sum()), 'problem')} a proved lower "
+                        f"bound lies above an objective that another run verified, first on {found.data[p]}, "
+                        f"{found.formulation[p]}. One of the two is wrong: please report it.")
+    if (other := states_of_rows(table, found) == OTHER_ACCURACY).any():
+        asked = ", ".join(f"{value:.0e}" for value in np.unique(table["accuracy"][other]))
+        yield Statement(FAIR, "Several accuracies", f"{plural(int(other.sum()), 'run')} asked for {asked}: they do not "
+                        f"count beside those that suit {found.accuracy:.0e}; --accuracy compares at another one.")
+    if k := overall.infeasible:
+        have = "has" if k == 1 else "have"
+        yield Statement(FAIR, "Infeasible problems", f"{plural(k, 'problem')} {have} no solution according to every "
+                        "solver that came to an answer. This counts neither for nor against them.")
 
 
-def _refuted(found: Results, table: Table) -> Statement | None:
-    """Warn where a proved lower bound lies above a verified objective of another run: a proof is wrong."""
+def _refuted(found: Results, table: Table) -> np.ndarray:
+    """Return where a proved lower bound lies above a verified objective of another run, (P,): a proof is wrong."""
     if not found.row.size:
-        return None
-    there = np.isfinite(found.objective)
-    proved = there & table["proved"][found.row] & np.isfinite(table["bound"][found.row])
-    bounds = np.max(np.where(proved, table["bound"][found.row], -np.inf), axis=1)
+        return np.zeros(0, dtype=bool)
+    there, bound = np.isfinite(found.objective), table["bound"][found.row]
+    proved = there & table["proved"][found.row] & np.isfinite(bound)
+    least = np.max(np.where(proved, bound, -np.inf), axis=1)
     best = np.min(np.where(there, found.objective, np.inf), axis=1)
     with np.errstate(invalid="ignore"):
-        wrong = np.isfinite(bounds) & np.isfinite(best) & ((bounds - best) / found.size > max(VALUE, found.tolerance))
-    if not wrong.any():
-        return None
-    p = int(np.flatnonzero(wrong)[0])
-    return Statement(BAD, "A proof is contradicted", f"On {plural(int(wrong.sum()), 'problem')} a proved lower bound "
-                     f"lies above an objective that another run verified, first on {found.data[p]}, "
-                     f"{found.formulation[p]}. One of the two is wrong: please report it.")
+        return np.isfinite(least) & np.isfinite(best) & ((least - best) / found.size > max(VALUE, found.tolerance))
 
 
 def _false_claims(table: Table, found: Results) -> tuple[FalseClaim, ...]:
@@ -175,7 +168,7 @@ def _false_claims(table: Table, found: Results) -> tuple[FalseClaim, ...]:
     for p, s in zip(*np.nonzero(found.state == CONTRADICTED)):
         winner = found.solvers[int(np.flatnonzero(found.solved[p])[0])]
         lies.append((int(found.row[p, s]), f"{winner} has a verified point"))
-    groups = group_words(((table["solver"][i], table["formulation"][i], table["status_claimed"][i]), reason)
+    groups = group(((table["solver"][i], table["formulation"][i], table["status_claimed"][i]), reason)
                          for i, reason in lies)
     claims = [FalseClaim(key[0], key[1], len(reasons), key[2], min(reasons)) for key, reasons in groups.items()]
     return tuple(sorted(claims, key=lambda c: (-c.count, c.solver, c.formulation, c.claimed)))
@@ -184,12 +177,8 @@ def _false_claims(table: Table, found: Results) -> tuple[FalseClaim, ...]:
 def _failures(found: Results) -> tuple[Failure, ...]:
     failed = zip(*np.nonzero(~np.isin(found.state, (SOLVED, NOT_RUN, UNTIMED))))
     said = [(found.solvers[s], str(found.state[p, s]), str(found.reason[p, s])) for p, s in failed]
-    groups = group_words(((solver, state, without_numbers(reason)), reason) for solver, state, reason in said)
+    groups = group(((solver, state, NUMBER.sub("…", reason)), reason) for solver, state, reason in said)
     failures = [Failure(solver, state, reasons[0] if len(set(reasons)) == 1 else shape, len(reasons))
                 for (solver, state, shape), reasons in groups.items()]
     return tuple(sorted(failures, key=lambda f: (f.state == REFUSED, -f.count, f.solver, f.state, f.reason)))
 
-
-def without_numbers(reason: str) -> str:
-    """Replace the numbers in a sentence, so that sentences of one kind count together."""
-    return re.sub(r"(?<![A-Za-z_])[-+]?\d[\d.,]*(?:e[-+]?\d+)?", "…", reason)
