@@ -102,7 +102,8 @@ def creeps(criterion: Criterion, x: Array) -> bool:
     """Whether the slowest pole acts longer than an experiment."""
     if criterion.dynamics not in criterion.unknowns.slices:
         return False
-    return np.abs(poles_of(criterion, x)).max() > 1 - 1 / max(e.n_samples for e in criterion.data.experiments)
+    slowest = float(np.abs(poles_of(criterion, x)).max())
+    return slowest > 1 - 1 / max(e.n_samples for e in criterion.data.experiments)
 
 
 def _on_border(poles: Array, allowed: Callable[[Array], bool]) -> bool:
