@@ -36,10 +36,9 @@ from optid.core.leaves import Product
 from optid.core.problem import Problem
 from optid.core.terms import Inner, Length, Squares
 from optid.data.record import Data
-from optid.identify.subspace.procedure import SubspaceSteps
+from optid.identify.subspace.procedure import SubspaceSteps, subspace_steps
 from optid.identify.subspace.realisation import Realisation
 from optid.identify.subspace.shift import ShiftStep
-from optid.identify.subspace.steps import subspace_steps
 from optid.solving.solve import Procedure
 
 DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm of P^-1

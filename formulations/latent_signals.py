@@ -26,9 +26,9 @@ from optid.core.problem import Problem
 from optid.core.terms import Errors
 from optid.data.record import Data
 from optid.identify.arguments import in_memory
-from optid.identify.prediction_error.latent_functions import latent_channels, output_functions
+from optid.identify.prediction_error.latent_search import latent_channels, output_functions
 from optid.identify.prediction_error.state_errors import StateErrors
-from optid.identify.subspace.steps import subspace_steps
+from optid.identify.subspace.procedure import subspace_steps
 from optid.models import HammersteinSS
 from optid.solving.solve import Procedure
 

@@ -26,9 +26,8 @@ from optid.bases import Bases
 from optid.core.low_rank import LowRank
 from optid.core.problem import Problem
 from optid.data.record import Data
-from optid.identify.subspace.low_rank import Structured
-from optid.identify.subspace.low_rank_fit import fit_low_rank
-from optid.identify.subspace.steps import subspace_steps
+from optid.identify.subspace.low_rank import Structured, fit_low_rank
+from optid.identify.subspace.procedure import subspace_steps
 from optid.solving.solve import Procedure
 
 

@@ -36,8 +36,8 @@ from optid.bases import Bases
 from optid.core.problem import Problem
 from optid.core.terms import Errors
 from optid.data.record import Data
+from optid.identify.prediction_error.search import fit_transfer
 from optid.identify.prediction_error.transfer_errors import TransferErrors, TransferOrders, transfer_errors
-from optid.identify.prediction_error.transfer_fit import fit_transfer
 from optid.models.gauges import Gauge
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps

@@ -35,9 +35,9 @@ from optid.bases import Bases
 from optid.core.problem import Problem
 from optid.core.terms import Squares, Values
 from optid.data.record import Data
-from optid.identify.prediction_error.latent_functions import latent_channels
+from optid.identify.prediction_error.latent_search import latent_channels
 from optid.identify.simultaneous import Courses, TransferCourses, check_states, fit_equations, shoot
-from optid.identify.subspace.steps import subspace_steps
+from optid.identify.subspace.procedure import subspace_steps
 from optid.models import HammersteinSS
 from optid.models.equations import Equations
 from optid.models.gauges import Gauge

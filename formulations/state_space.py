@@ -39,7 +39,7 @@ from optid.data.record import Data
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.state_fit import fit_states
 from optid.identify.prediction_error.static_curve import static_curve
-from optid.identify.subspace.steps import subspace_steps
+from optid.identify.subspace.procedure import subspace_steps
 from optid.models import HammersteinSS
 from optid.models.roots import modal_weight
 from optid.solving.solve import Procedure

@@ -122,7 +122,7 @@ def simulation_bound(records: Sequence[Array], expansion: Expansion, n: int, wei
         block_rows: of the fit; the bound is the best of one, two and four times as many.
         said: what else there is to say about optimality.
     """
-    x = expansion.with_simulated(False)
+    x = replace(expansion, simulated=False)
     count, signals = sum(len(record) for record in records), x.p + x.q + x.l
     longest = max(len(record) for record in records)
     tried = [a for a in (block_rows, 2 * block_rows, 4 * block_rows)

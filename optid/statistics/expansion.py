@@ -138,10 +138,6 @@ class Expansion:
         intercepts = np.concatenate([np.zeros(0), *(family.intercept for family in self.feedback)])
         return -e @ slopes, -e @ intercepts
 
-    def with_simulated(self, simulated: bool = True) -> "Expansion":
-        """Return the same expansion, with or without the functions of simulated outputs."""
-        return replace(self, simulated=simulated)
-
     def without_feedback(self) -> "Expansion":
         """Return the open-loop expansion."""
         return replace(self, feedback=(), simulated=False)

@@ -1,8 +1,7 @@
 """Gram matrices of block Hankel matrices that are never formed.
 
 A column of a block Hankel matrix is a window: the samples s(k), ..., s(k + rows - 1) of d signals, a row of lagged
-signals in `optid.statistics.sums`. Windows that touch a missing sample are left out. Statistics add up over
-experiments, chunks and workers.
+signals in `optid.statistics.sums`. Windows that touch a missing sample are left out.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -62,15 +61,6 @@ class HankelStatistics:
     def method(self) -> Literal["gram", "qr"]:
         """How the statistics were taken."""
         return "gram" if self.factor is None else "qr"
-
-    def __add__(self, other: "HankelStatistics") -> "HankelStatistics":
-        if (self.rows, self.names) != (other.rows, other.names) or not np.array_equal(self.centre, other.centre):
-            raise StructureError("Hankel statistics to be added must have the same block rows, signals and centre.")
-        factor = None  # digits that one Gram matrix has lost do not come back
-        if self.factor is not None and other.factor is not None:
-            factor = add_to_root(self.factor, other.factor)
-        return HankelStatistics(self.rows, self.names, self.centre, self.gram + other.gram,
-                                self.candidates + other.candidates, factor)
 
     def at(self, signals: Sequence[int] | range, rows: Sequence[int] | range | None = None) -> NDArray[np.intp]:
         """Return the positions of some signals at some block rows (all by default), block rows outermost."""

@@ -1,7 +1,7 @@
 """The regression y = Phi theta + e behind an ARX model with static nonlinearities, and its sufficient statistics.
 
 Nothing of size samples x parameters is formed: one pass over the record gives the Gram matrix of [Phi | Y], which is
-all that a least-squares objective needs. Statistics add up, over chunks, experiments and workers.
+all that a least-squares objective needs. Sums of parts add up, over chunks, experiments and workers.
 """
 
 import warnings
@@ -15,10 +15,10 @@ import numpy as np
 from optid.arrays import Array
 from optid.bases.basis import Basis
 from optid.data.reduction import available_cores, map_parts
-from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.errors import DataError, DataWarning, RankError
 from optid.models.layout import Layout
 from optid.statistics.blocks import CHUNK, Frame, blocks_of, check_channels, cut, records, stretches, used_rows
-from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
+from optid.statistics.factors import conditioning, dependent_column, root_of_gram
 from optid.statistics.sums import Factor, Sums, Total, total_of_parts
 
 if TYPE_CHECKING:
@@ -38,10 +38,7 @@ KEPT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """Sufficient statistics of the regression: all that least squares needs to know of a record.
-
-    Statistics of one layout add up exactly: `a + b` are those of both records.
-    """
+    """Sufficient statistics of the regression: all that least squares needs to know of a record."""
 
     layout: Layout  # the columns
     gram: Array  # (n + l, n + l) Gram matrix of [Phi | Y], in squared data units
@@ -50,15 +47,6 @@ class Statistics:
     # upper triangular R with R^T R = gram, from a streamed QR decomposition; None when there was none
     factor: Array | None = None
     constants: int = 0  # of experiments that are eliminated, beside the one of the column of ones
-
-    def __add__(self, other: "Statistics") -> "Statistics":
-        if self.layout != other.layout:
-            raise StructureError("Statistics to be added must have the same layout: na, nb, nk, bases and names.")
-        factor = None  # digits that one Gram matrix has lost do not come back
-        if self.factor is not None and other.factor is not None:
-            factor = add_to_root(self.factor, other.factor)
-        return Statistics(self.layout, self.gram + other.gram, self.rows + other.rows,
-                          self.candidates + other.candidates, factor)
 
     @property
     def method(self) -> Literal["gram", "qr"]:
@@ -157,7 +145,7 @@ def accumulate(data: "Data | Stream", layout: Layout, weights: Sequence[Array] |
                threads: int | None = None) -> Statistics:
     """Take the Gram matrix in one pass, without asking whether the record determines the parameters.
 
-    This is for parts of a record that are to be added; arguments and errors as `collect`.
+    Arguments and errors as `collect`.
     """
     threads = available_cores(threads)
     sums = _total(data, layout, weights, chunk, threads, partial(Sums, Frame.of(layout)))

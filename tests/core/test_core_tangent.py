@@ -13,8 +13,8 @@ from optid.backends.conic import solve_with
 from optid.core.leaves import Affine, Product, Quantity
 from optid.core.statement import class_of, for_solvers, is_stated, statement_of
 from optid.errors import StructureError
+from optid.identify.prediction_error.criterion import criterion_of, step_problem
 from optid.identify.prediction_error.static_curve import static_curve
-from optid.identify.prediction_error.tangent_problem import criterion_of, step_problem
 from optid.identify.prediction_error.transfer_errors import TransferOrders, transfer_errors
 from optid.program.solution import Status
 

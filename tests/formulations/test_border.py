@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 import optid
 from optid.errors import DataWarning
-from optid.identify.prediction_error import border, tangent_descent
+from optid.identify.prediction_error import border
 from optid.program.solution import Status
 
 REGIONS = {
@@ -95,8 +95,8 @@ def test_a_pole_that_a_programme_left_a_rounding_outside_does_not_hold_the_other
     rng, radius, kept = np.random.default_rng(1), 0.6, []
     u = rng.standard_normal(300)
     y = lfilter([1.0, 0.5], np.real(np.poly([0.9, 0.75 + 0.37j, 0.75 - 0.37j])), u)
-    monkeypatch.setattr(tangent_descent, "along_border", lambda *given: kept.append(given) or given[2])
-    with warnings.catch_warnings():
+    with monkeypatch.context() as watched, warnings.catch_warnings():
+        watched.setattr(border, "along_border", lambda *given: kept.append(given) or given[2])
         warnings.simplefilter("ignore", DataWarning)
         optid.fit(optid.Data(u, y / y.std() + 0.1 * rng.standard_normal(300)), "oe.exact", na=3, nb=2, nk=0,
                   constraints=[f"stable:{radius}"])

@@ -1,5 +1,7 @@
 """The step for B, D, E and x0, its signals and simulated instruments, against models simulated sample by sample."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from refusals import refuses
@@ -164,7 +166,7 @@ def test_an_experiment_may_begin_with_a_gap():
 def test_instruments_are_two_stage_least_squares():
     rng = np.random.default_rng(3)
     records = [np.hstack([record, rng.uniform(-1, 1, (len(record), 2))]) for record in records_of(rng, [90, 70])]
-    expansion = expansion_of(records).with_simulated()
+    expansion = replace(expansion_of(records), simulated=True)
     form = ObserverForm(A, C, np.zeros((2, 2)), expansion, 2, (True, True), True, np.ones(2), instrumented=True)
     step = observer_problem(records, form, None)
     parts = [columns(form, record, e) for e, record in enumerate(records)]

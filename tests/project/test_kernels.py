@@ -94,7 +94,7 @@ print(*(len(kernel.signatures) for kernel in (kernels.march, kernels.sensitiviti
 def test_kernels_stay_within_their_arrays(tmp_path):
     """Every kernel is called by one of these tests, with every index checked."""
     tests = Path(__file__).parents[1]
-    names = ["recursion", "recursions", "tracking", "latent_signals", "hammerstein_ss", "noise_sensitivities",
+    names = ["recursion", "recursions", "tracking", "latent_signals", "hammerstein_ss", "sensitivities",
              "group_sparse", "fault_pairs", "fault_injection", "monitor", "plants", "regressors", "process",
              "process_responses", "continuous"]
     files = [path for name in names for path in tests.glob(f"*/test_{name}.py")]

@@ -1,6 +1,7 @@
 """Bases against closed forms, scipy's own splines, finite differences and numerical integrals."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,8 +27,7 @@ from optid.errors import DataError, LookupFailed, StructureError
 CUBE = UserFunctions((lambda u: u, lambda u: u**3), ("u", "u3"), (np.ones_like, lambda u: 3 * u**2))
 BASES = [
     Triangular(1), Triangular(7), Trigonometric(3), Polynomial(5), BSpline(5), BSpline(4, degree=2),
-    BSpline(6, degree=1), BSpline(3, degree=4), PiecewiseConstant(6), Linear(), CUBE,
-]  # fmt: skip
+    BSpline(6, degree=1), BSpline(3, degree=4), PiecewiseConstant(6), Linear(), CUBE]
 FITTED = [basis.with_interval(-0.7, 1.3) for basis in BASES]
 SMOOTH = [basis for basis in FITTED if not isinstance(basis, (Triangular, PiecewiseConstant))]
 
@@ -47,15 +47,10 @@ def complete(basis, u):
     return table
 
 
-def with_outside(basis, rule):
-    arguments = {name: getattr(basis, name) for name in basis.__dataclass_fields__} | {"outside": rule}
-    return type(basis)(**arguments)
-
-
 @every
 @pytest.mark.parametrize("rule", ["clamp", "linear", "extrapolate"])
 def test_values_are_the_complete_family_times_the_contrast(basis, rule):
-    basis = with_outside(basis, rule)
+    basis = replace(basis, outside=rule)
     u = np.random.default_rng(0).uniform(-1.5, 2.0, 300)
     assert basis.values(u) == pytest.approx(complete(basis, u) @ basis.contrast, abs=1e-12)
     assert basis.values(u).shape == (300, basis.size)
@@ -72,7 +67,7 @@ def test_no_basis_contains_the_constant(basis):
 
 @pytest.mark.parametrize("basis", [basis for basis in FITTED if basis.dropped is not None])
 def test_complete_local_family_sums_to_one_also_when_extrapolating(basis):
-    weights = with_outside(basis, "extrapolate").local(np.linspace(-2, 3, 101))[1]
+    weights = replace(basis, outside="extrapolate").local(np.linspace(-2, 3, 101))[1]
     assert weights.sum(axis=1) == pytest.approx(np.ones(101), abs=1e-9)
 
 
@@ -110,9 +105,8 @@ def test_bspline_equals_scipy_inside_and_extrapolated(degree):
 def test_legendre_and_trigonometric_closed_forms():
     v = np.linspace(-1, 1, 50)
     u = 3 + 2 * v
-    assert Polynomial(3).with_interval(1, 5).values(u) == pytest.approx(
-        np.column_stack([v, 1.5 * v**2 - 0.5, 2.5 * v**3 - 1.5 * v])
-    )
+    legendre = np.column_stack([v, 1.5 * v**2 - 0.5, 2.5 * v**3 - 1.5 * v])
+    assert Polynomial(3).with_interval(1, 5).values(u) == pytest.approx(legendre)
     expected = [g(np.pi * j * v / 1.25) for j in (1, 2) for g in (np.cos, np.sin)]
     assert Trigonometric(2).with_interval(1, 5).values(u) == pytest.approx(np.column_stack(expected))
 
@@ -127,16 +121,15 @@ def test_piecewise_constant_has_one_level_a_cell_and_the_last_cell_is_closed():
 @pytest.mark.parametrize("basis", [*SMOOTH, FITTED[1]], ids=names([*SMOOTH, FITTED[1]]))
 @pytest.mark.parametrize("rule", ["clamp", "linear", "extrapolate"])
 def test_slopes_equal_finite_differences(basis, rule):
-    basis = with_outside(basis, rule)
+    basis = replace(basis, outside=rule)
     u = np.random.default_rng(4).uniform(-1.2, 1.8, 60)
-    step = 1e-6
-    numeric = (basis.values(u + step) - basis.values(u - step)) / (2 * step)
+    numeric = (basis.values(u + 1e-6) - basis.values(u - 1e-6)) / 2e-6
     assert basis.slopes(u) == pytest.approx(numeric, abs=2e-6 * np.max(np.abs(numeric)))
 
 
 @every
 def test_beyond_the_interval_it_may_go_on_straight(basis):
-    basis = with_outside(basis, "linear")
+    basis = replace(basis, outside="linear")
     ends = np.array([-0.7, 1.3])
     straight = basis.values(ends) + basis.slopes(ends) * np.array([[-0.4], [2.0]])
     digits = 1e-7 if isinstance(basis, UserFunctions) else 1e-12  # slopes of theirs are differences
@@ -229,7 +222,6 @@ def test_bounds_on_rows_are_bounds_between_all_points(basis):
 def test_penalty_equals_the_numerical_integral(basis):
     mu = np.random.default_rng(9).normal(size=basis.size)
     lo, hi = basis.interval
-    breaks = list(np.linspace(lo, hi, 100)[1:-1])
     slope = lambda u: float((basis.slopes(np.array([u])) @ mu)[0])  # noqa: E731
     kinks = None if not hasattr(basis, "p") else list(np.linspace(lo, hi, basis.p + 1)[1:-1]) or None
     first = quad(lambda u: slope(u) ** 2, lo, hi, points=kinks, limit=300)[0]
@@ -244,7 +236,6 @@ def test_penalty_equals_the_numerical_integral(basis):
     bend = ((basis.slopes(fine + step) - basis.slopes(fine - step)) @ mu) / (2 * step)
     tolerance = 2e-2 if isinstance(basis, UserFunctions) else 1e-3
     assert mu @ basis.penalty(2) @ mu == pytest.approx(np.trapezoid(bend**2, fine), rel=tolerance, abs=1e-9)
-    assert len(breaks) == 98
 
 
 @every
@@ -260,7 +251,7 @@ def test_missing_samples(basis):
 
 @every
 def test_error_outside_names_sample_and_value(basis):
-    basis = with_outside(basis, "error")
+    basis = replace(basis, outside="error")
     basis.values([-0.7, 1.3])
     refuses(DataError, r"Sample 1 .* 5, outside the interval \[-0.7, 1.3\]", basis.values, [0.0, 5.0])
     refuses(DataError, "Sample 1", basis.slopes, [0.0, 5.0])
@@ -273,12 +264,11 @@ def test_change_of_units(basis, scale, offset):
     if isinstance(basis, UserFunctions):
         refuses(StructureError, "keeps the units", basis.in_units, scale, offset)
         return
-    basis = with_outside(basis, "extrapolate")
+    basis = replace(basis, outside="extrapolate")
     new, matrix, constant = basis.in_units(scale, offset)
     u = np.linspace(-0.69, 1.29, 41) + 1e-3
-    assert new.values(scale * u + offset) @ matrix + constant == pytest.approx(
-        basis.values(u), abs=1e-6 * (1 + 1 / scale)
-    )
+    found = new.values(scale * u + offset) @ matrix + constant
+    assert found == pytest.approx(basis.values(u), abs=1e-6 * (1 + 1 / scale))
 
 
 @pytest.mark.parametrize("basis", BASES[:-1] + FITTED[:-1])
@@ -293,69 +283,41 @@ def test_user_functions_ask_for_themselves():
     assert again.values([0.5]) == pytest.approx(np.array([[0.5, 0.125]]))
 
 
-@pytest.mark.parametrize(
-    ("text", "basis"),
-    [
-        ("triangular:10", Triangular(10)),
-        ("legendre:4", Polynomial(4)),
-        ("polynomial:4", Polynomial(4)),
-        ("BSpline:8:degree=2", BSpline(8, 2)),
-        ("trigonometric:5:half_range=1.1:outside=extrapolate", Trigonometric(5, 1.1, outside="extrapolate")),
-        ("piecewiseconstant:6", PiecewiseConstant(6)),
-        ("triangular:8:interval=-1..2.5", Triangular(8, (-1.0, 2.5))),
-        ("linear", Linear()),
-    ],
-)
+@pytest.mark.parametrize("text, basis", [
+    ("triangular:10", Triangular(10)), ("legendre:4", Polynomial(4)), ("polynomial:4", Polynomial(4)),
+    ("BSpline:8:degree=2", BSpline(8, 2)), ("piecewiseconstant:6", PiecewiseConstant(6)), ("linear", Linear()),
+    ("trigonometric:5:half_range=1.1:outside=extrapolate", Trigonometric(5, 1.1, outside="extrapolate")),
+    ("triangular:8:interval=-1..2.5", Triangular(8, (-1.0, 2.5)))])
 def test_parse(text, basis):
     assert parse(text) == basis
 
 
-@pytest.mark.parametrize(
-    ("text", "error", "words"),
-    [
-        ("triangle:4", LookupFailed, "triangular"),
-        ("triangular", StructureError, "triangular:10"),
-        ("triangular:x", StructureError, "cannot be read"),
-        ("triangular:0", StructureError, "an integer from 1 to 5000"),
-        ("triangular:4:colour=red", StructureError, "colour"),
-        ("triangular:4:outside=mirror", StructureError, "clamp"),
-        ("triangular:4:degree=2", StructureError, "degree"),
-        ("triangular:4:interval=1", StructureError, "cannot be read"),
-        ("triangular:4:interval=1..0", StructureError, "interval"),
-        ("linear:3", StructureError, "write linear"),
-    ],
-)
+@pytest.mark.parametrize("text, error, words", [
+    ("triangle:4", LookupFailed, "triangular"), ("triangular", StructureError, "triangular:10"),
+    ("triangular:x", StructureError, "cannot be read"), ("triangular:0", StructureError, "an integer from 1 to 5000"),
+    ("triangular:4:colour=red", StructureError, "colour"), ("triangular:4:outside=mirror", StructureError, "clamp"),
+    ("triangular:4:degree=2", StructureError, "degree"), ("triangular:4:interval=1", StructureError, "cannot be read"),
+    ("triangular:4:interval=1..0", StructureError, "interval"), ("linear:3", StructureError, "write linear")])
 def test_parse_refuses(text, error, words):
     refuses(error, words, parse, text)
 
 
-@pytest.mark.parametrize(
-    "build",
-    [
-        lambda: Triangular(2.5),
-        lambda: Triangular(3, interval=(1, 1)),
-        lambda: Triangular(3, interval=(0, np.inf)),
-        lambda: Trigonometric(3, half_range=0.5),
-        lambda: Triangular(3).values([0.0]),
-        lambda: Triangular(3).with_interval(0, 1).penalty(3),
-        lambda: UserFunctions(()),
-        lambda: UserFunctions((np.sin,), ("a", "b")),
-        lambda: UserFunctions((np.ones_like,), ("one",)).with_interval(0, 1),
-        lambda: UserFunctions((lambda u: np.sin(u) ** 2, lambda u: np.cos(u) ** 2), ("s", "c")).with_interval(0, 1),
-        lambda: UserFunctions((lambda u: 3.0,), ("three",), interval=(0, 1)),
-        lambda: from_dict({"type": "triangular", "cells": 3}),
-    ],
-)
+@pytest.mark.parametrize("build", [
+    lambda: Triangular(2.5), lambda: Triangular(3, interval=(1, 1)), lambda: Triangular(3, interval=(0, np.inf)),
+    lambda: Trigonometric(3, half_range=0.5), lambda: Triangular(3).values([0.0]),
+    lambda: Triangular(3).with_interval(0, 1).penalty(3),
+    lambda: UserFunctions(()), lambda: UserFunctions((np.sin,), ("a", "b")),
+    lambda: UserFunctions((np.ones_like,), ("one",)).with_interval(0, 1),
+    lambda: UserFunctions((lambda u: np.sin(u) ** 2, lambda u: np.cos(u) ** 2), ("s", "c")).with_interval(0, 1),
+    lambda: UserFunctions((lambda u: 3.0,), ("three",), interval=(0, 1)),
+    lambda: from_dict({"type": "triangular", "cells": 3})])
 def test_bad_arguments(build):
     with pytest.raises(StructureError):
         build()
 
 
 def test_constant_input_and_wrong_shape():
-    with pytest.raises(DataError, match="constant at 2"):
-        Triangular(3).with_interval(2.0, 2.0)
-    with pytest.raises(DataError, match="finite"):
-        Triangular(3).with_interval(np.nan, 2.0)
-    with pytest.raises(DataError, match=r"\(N,\)"):
-        Triangular(3).with_interval(0, 1).values(np.zeros((4, 2)))
+    refuses(DataError, "constant at 2", Triangular(3).with_interval, 2.0, 2.0)
+    refuses(DataError, "finite", Triangular(3).with_interval, np.nan, 2.0)
+    refuses(DataError, r"\(N,\)", Triangular(3).with_interval(0, 1).values, np.zeros((4, 2)))
     assert Triangular(3, interval=(0, 1)).with_interval(5, 6).interval == (0, 1)

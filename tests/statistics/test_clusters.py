@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 import pytest
+from refusals import refuses
 from test_reduction import STRUCTURE, assert_same_fit, frame_of, record_folders, two_experiments
 
 import optid
@@ -126,8 +127,7 @@ def test_a_partition_that_kills_every_worker_is_an_error_in_words(two_processes,
 def test_errors_of_the_record_come_back_as_they_are(record, folders, client):
     stream = optid.open_stream(folders, scheduler=client)
     (folders[1] / "part.7.parquet").unlink()
-    with pytest.raises(DataError, match="machine .* cannot read .*part.7.parquet.*every worker sees"):
-        optid.fit(stream, **STRUCTURE)
+    refuses(DataError, "machine .* cannot read .*part.7.parquet.*every worker sees", optid.fit, stream, **STRUCTURE)
     frame = frame_of(record.experiments[0]).assign(u=np.nan)
     with pytest.raises(DataError, match="channel 'u': every sample is missing"):
         optid.fit(optid.open_stream(dd.from_pandas(frame, npartitions=3, sort=False), scheduler=client), **STRUCTURE)

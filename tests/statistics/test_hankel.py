@@ -49,19 +49,6 @@ def test_gram_is_that_of_the_formed_windows(seed, rows, d, chunk, lengths, share
     np.testing.assert_allclose(streamed.factor.T @ streamed.factor, found.gram, atol=1e-10 * np.abs(found.gram).max())
 
 
-def test_statistics_add_up():
-    rng = np.random.default_rng(3)
-    records = walks(rng, [100, 80], 2)
-    for method in ("gram", "qr"):
-        whole = hankel_statistics(records, 4, method=method)
-        parts = hankel_statistics(records[:1], 4, method=method) + hankel_statistics(records[1:], 4, method=method)
-        np.testing.assert_allclose(parts.gram, whole.gram, rtol=1e-12)
-        assert (parts.windows, parts.candidates, parts.method) == (whole.windows, whole.candidates, method)
-    np.testing.assert_allclose(parts.factor, whole.factor, atol=1e-10)
-    with pytest.raises(StructureError, match="same block rows"):
-        whole + hankel_statistics(records, 5)
-
-
 def test_large_transient_does_not_cost_digits():
     rng = np.random.default_rng(0)
     record = rng.standard_normal((400, 1))
@@ -139,33 +126,17 @@ def system(rng, count, noise=0.1):
     return np.hstack([u, y])
 
 
-def split(record, rows):
-    """Future and past blocks (rows of the Hankel matrix) of inputs and outputs, formed."""
-    table = formed([record], 2 * rows)[:, 1:].T.reshape(2 * rows, 3, -1)
-    return {"up": table[:rows, :2].reshape(2 * rows, -1), "uf": table[rows:, :2].reshape(2 * rows, -1),
-            "yp": table[:rows, 2], "yf": table[rows:, 2]}
-
-
 @pytest.mark.parametrize("form", ["projection", "correlation"])
 @pytest.mark.parametrize("tolerance", [None, 1e-12])
 @pytest.mark.parametrize("future", [True, False])
 def test_blocks_against_projectors(form, tolerance, future):
     record, s = system(np.random.default_rng(5), 400), 4
-    h = split(record, s)
-    statistics = hankel_statistics([record], 2 * s)
-    past, coming = range(s), range(s, 2 * s)
-    z = statistics.at([0, 1, 2], past)
-    z_formed = np.vstack([h["up"], h["yp"]])
-    order = np.concatenate([np.arange(2 * s).reshape(s, 2), (2 * s + np.arange(s))[:, None]], axis=1).ravel()
-    z_formed = z_formed[order]
-    if future:
-        z, z_formed = np.concatenate([statistics.at([0, 1], coming), z]), np.vstack([h["uf"], z_formed])
-    found = rq(statistics, z, statistics.at([0, 1], coming), statistics.at([2], coming), form=form, tolerance=tolerance)
-    if form == "projection":
-        onto = np.linalg.pinv(z_formed) @ z_formed
-    else:
-        onto = z_formed.T / z_formed.shape[1]
-    phi, y = h["uf"] @ onto, h["yf"] @ onto
+    statistics, table = hankel_statistics([record], 2 * s), formed([record], 2 * s).T
+    phi, y = statistics.at([0, 1], range(s, 2 * s)), statistics.at([2], range(s, 2 * s))
+    z = np.concatenate([*[phi] * future, statistics.at([0, 1, 2], range(s))])
+    found = rq(statistics, z, phi, y, form=form, tolerance=tolerance)
+    onto = np.linalg.pinv(table[z]) @ table[z] if form == "projection" else table[z].T / table.shape[1]
+    phi, y = table[phi] @ onto, table[y] @ onto
     perp = y - y @ np.linalg.pinv(phi) @ phi
     np.testing.assert_allclose(found.decomposition[1], np.linalg.svd(perp, compute_uv=False)[:s], rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(found.gain, y @ np.linalg.pinv(phi), atol=1e-8)

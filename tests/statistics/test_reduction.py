@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refuses
-from test_regressors import assert_gram, cases, formed
+from test_regressors import assert_statistics, cases
 
 import optid
 from optid.data.reading import parquet
 from optid.data.record import Data
 from optid.data.reduction import FAN_IN, tree
 from optid.errors import DataError, RankError
-from optid.statistics import accumulate, collect, factorise
+from optid.statistics import collect
 from optid.statistics.blocks import Frame
 from optid.statistics.sums import Sums, total_of_parts
 
@@ -50,14 +50,7 @@ def test_sums_of_parts_equal_the_formed_regressor(case, draw):
     """Parts of any length, also empty and shorter than the lags; several experiments; missing samples."""
     _, data, layout, chunk = case
     borders = [sorted(draw.draw(st.lists(st.integers(0, len(e.y)), max_size=30))) for e in data.experiments]
-    lengths = [np.diff([0, *inside]) for inside in borders]
-    stream = Cut(data, lengths)
-    rows, ones, _ = formed(data, layout)
-    for take in (accumulate, factorise):
-        statistics = take(stream, layout, chunk=chunk)
-        assert statistics.rows == len(rows)
-        assert statistics.candidates == sum(len(e.y) - layout.first_row for e in data.experiments)
-        assert_gram(statistics.gram, rows, ones)
+    assert_statistics(Cut(data, [np.diff([0, *inside]) for inside in borders]), data, layout, chunk)
 
 
 @given(cases())

@@ -88,15 +88,20 @@ def cases(draw):
     return rng, data, layout_of(data, bases, na, nb, nk), draw(st.integers(1, 200))
 
 
-@given(cases())
-def test_statistics_equal_the_formed_regressor(case):
-    rng, data, layout, chunk = case
+def assert_statistics(source, data, layout, chunk):
+    """Of a record, or of a stream of it, both ways."""
     rows, ones, _ = formed(data, layout)
     for take in (accumulate, factorise):
-        statistics = take(data, layout, chunk=chunk)
+        statistics = take(source, layout, chunk=chunk)
         assert statistics.rows == len(rows)
         assert statistics.candidates == sum(len(e.y) - layout.first_row for e in data.experiments)
         assert_gram(statistics.gram, rows, ones)
+
+
+@given(cases())
+def test_statistics_equal_the_formed_regressor(case):
+    rng, data, layout, chunk = case
+    assert_statistics(data, data, layout, chunk)
     weights = [rng.random(len(e.y)) * (rng.random(len(e.y)) > 0.2) for e in data.experiments]
     rows, scales, _ = formed(data, layout, weights)
     for take in (accumulate, factorise):
@@ -118,27 +123,11 @@ def test_residuals_equal_the_formed_regressor(case):
         np.testing.assert_allclose(found[e][k], expected, rtol=0, atol=1e-11)
 
 
-@given(cases())
-def test_statistics_of_experiments_add_up(case):
-    _, data, layout, _ = case
-    for take in (accumulate, factorise):
-        parts = [take(Data(u=e.u, y=e.y), layout) for e in data.experiments]
-        total = sum(parts[1:], parts[0])
-        whole = take(data, layout)
-        assert (total.rows, total.candidates, total.method) == (whole.rows, whole.candidates, whole.method)
-        norms = np.sqrt(np.maximum(np.diag(whole.gram), 1e-300))
-        np.testing.assert_allclose(total.gram / norms[:, None] / norms, whole.gram / norms[:, None] / norms, atol=1e-12)
-        if whole.method == "qr":
-            np.testing.assert_allclose(total.factor.T @ total.factor, total.gram, atol=1e-12 * norms.max() ** 2)
-
-
 @given(cases(), st.lists(st.integers(1, 40), max_size=5))
 def test_stream_equals_record(case, lengths):
     _, data, layout, chunk = case
     one = Data(u=data.experiments[0].u, y=data.experiments[0].y)
-    stream = Chunks(one, lengths)
-    rows, ones, _ = formed(one, layout)
-    assert_gram(accumulate(stream, layout, chunk=chunk).gram, rows, ones)
+    assert_statistics(Chunks(one, lengths), one, layout, chunk)
 
 
 @given(cases(), st.integers(2, 4))
@@ -282,40 +271,23 @@ def test_dependent_columns_are_named(take):
         _ = take(data, layout).root
 
 
-def test_silent_function_is_named():
-    u = np.random.default_rng(9).uniform(0.5, 1, 400)
-    data = Data(u=u, y=u, inputs=["current"])
-    layout = layout_of(data, (Triangular(4),), 0, [2], [0])
-    with pytest.raises(RankError, match=r"Function 1 of 4 of Triangular .*'current'.*\[-1, -0\.\d+\].*never excited"):
-        collect(data, layout)
-
-
-def test_silent_output_is_named():
-    data = Data(u=np.random.default_rng(9).uniform(-1, 1, 400), y=np.zeros(400), outputs=["thrust"])
-    refuses(RankError, "Output 'thrust' is zero", collect, data, layout_of(data, (Triangular(4),), 1, [2], [0]))
-
-
-def test_function_reached_in_lost_rows_only_is_silent():
+def undetermined():
+    """Records of one input, the basis with na, nb and nk, and the words that refuse them."""
     rng = np.random.default_rng(10)
-    u, y = rng.uniform(0, 1, 400), rng.standard_normal(400)
-    u[200], y[200:204] = -1.0, np.nan
-    data = Data(u=u, y=y)
-    refuses(RankError, "Function 1 of 4", collect, data, layout_of(data, (Triangular(4),), 1, [2], [0]))
+    u, y = rng.uniform(0.5, 1, 400), rng.standard_normal(400)
+    yield Data(u, u, inputs=["current"]), Triangular(4), 0, 2, 0, (
+        r"Function 1 of 4 of Triangular .*'current'.*\[-1, -0\.\d+\].*never excited")
+    yield Data(rng.uniform(-1, 1, 400), 0 * u, outputs=["thrust"]), Triangular(4), 1, 2, 0, "Output 'thrust' is zero"
+    u[200], y[200:204] = -1.0, np.nan  # reached in lost rows only
+    yield Data(u, y), Triangular(4), 1, 2, 0, "Function 1 of 4"
+    yield random_data(rng, [30], 1, 1), Triangular(10), 2, 3, 0, "28 rows for 33 parameters: at least 37"
+    yield random_data(rng, [200], 1, 1, 0.3), Triangular(10), 2, 3, 0, r"Missing samples cost \d+ % of 198 rows"
+    yield random_data(rng, [100, 4], 1, 1), Triangular(3), 2, 2, 3, "experiment 2: 4 samples, but the lags reach back 4"
 
 
-def test_too_few_rows():
-    rng = np.random.default_rng(11)
-    data = random_data(rng, [30], 1, 1)
-    layout = layout_of(data, (Triangular(10),), 2, [3], [0])
-    refuses(RankError, r"28 rows for 33 parameters: at least 37", collect, data, layout)
-    data = random_data(rng, [200], 1, 1, share=0.3)
-    refuses(RankError, r"Missing samples cost \d+ % of 198 rows", collect, data, layout)
-
-
-def test_experiment_shorter_than_the_lags_is_named():
-    data = random_data(np.random.default_rng(12), [100, 4], 1, 1)
-    with pytest.raises(RankError, match="experiment 2: 4 samples, but the lags reach back 4"):
-        collect(data, layout_of(data, (Triangular(3),), 2, [2], [3]))
+@pytest.mark.parametrize("data, basis, na, nb, nk, words", list(undetermined()))
+def test_what_a_record_does_not_determine_is_named(data, basis, na, nb, nk, words):
+    refuses(RankError, words, collect, data, layout_of(data, (basis,), na, [nb], [nk]))
 
 
 def test_warns_below_half_of_the_rows():
@@ -358,8 +330,6 @@ def test_arguments_are_refused():
     refuses(DataError, "The data have 1 inputs", collect, Data(u=data.u[:, 0], y=data.y), layout)
     for threads in (0, True, 1.5):
         refuses(StructureError, "threads", collect, data, layout, threads=threads)
-    with pytest.raises(StructureError, match="same layout"):
-        _ = collect(data, layout) + collect(data, Layout(**good | {"na": 2}))
 
 
 def test_basis_that_points_outside_its_family_is_refused():

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -132,20 +132,6 @@ class Waveform:
         return low + step * np.round((u - low) / step)
 
 
-class ExpandedRegressor(NamedTuple):
-    """The regressor whose condition number a design keeps small: functions of inputs and outputs at some lags."""
-
-    basis: Bases
-    feedback_basis: FeedbackBases
-    rows: int  # lags of every function
-
-    def expansion(self, record: Data) -> Expansion:
-        """Return the functions of a record."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)  # outputs that are nearly linear: `rules.check_feedback`
-            return expand(record, self.basis, self.feedback_basis)
-
-
 def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels: int | None = None,
            band: tuple[float, float] | None = None, amplitude: Any = None, shaped: bool = False,
            basis: Bases = "polynomial:4", feedback_basis: FeedbackBases = None, rows: int = 10, hold: int = 5,
@@ -190,7 +176,6 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
     measured = frequency_response(like)
     limits = (0.0, 0.5 / (hold * like.dt)) if kind == "levels" else _band(band, measured)
     waveform = Waveform(kind, n, like.dt, limits, levels, hold, periods)
-    regressor = ExpandedRegressor(basis, feedback_basis, rows)
     top = 0.9 * float(measured.frequency[-1])
 
     def weight(c: int, frequency: Array) -> Array:
@@ -203,7 +188,11 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
         if kind == "chirp":  # inputs that sweep in step could not be distinguished
             columns = [np.roll(x, c * n // (SWEEPS * like.m)) for c, x in enumerate(columns)]
         u = np.column_stack([waveform.on_levels(x, span) for x, span in zip(columns, ranges)])
-        return _expected(u, waveform, like, measured, regressor, seed + draw)
+        record = Data(u, _predicted(u, like, measured, seed + draw), like.dt, inputs=like.inputs, outputs=like.outputs)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # outputs that are nearly linear: `rules.check_feedback`
+            expansion = expand(record, basis, feedback_basis)
+        return _expected(record, expansion, rows, waveform, like, measured.segments)
 
     while True:
         draws = map(realise, range(1 if kind == "chirp" else candidates))
@@ -261,14 +250,11 @@ def _band(band: tuple[float, float] | None, measured: FrequencyResponse) -> tupl
     return float(band[0]), float(band[1])
 
 
-def _expected(u: Array, waveform: Waveform, like: Data, measured: FrequencyResponse, regressor: ExpandedRegressor,
-              seed: int) -> Excitation:
-    """Predict a record taken with u (N, m) and check it by the rules."""
-    y = _predicted(u, like, measured, seed)
-    record = Data(u, y, like.dt, inputs=list(like.inputs), outputs=list(like.outputs))
-    expansion, rows = regressor.expansion(record), regressor.rows
+def _expected(record: Data, expansion: Expansion, rows: int, waveform: Waveform, like: Data, segments: int
+              ) -> Excitation:
+    """Check a predicted record by the rules."""
     condition = expanded_condition(record, expansion, rows)
-    channels = list(zip(like.inputs, u.T, expansion.inputs))
+    channels = list(zip(like.inputs, record.u.T, expansion.inputs))
     few = rules.FEW_LEVELS if waveform.levels is None else 0  # no warning about a given number of levels
     checks = (*(rules.check_levels(name, x, one, few) for name, x, one in channels),
               *(rules.check_lines(name, [x], one, rows) for name, x, one in channels),
@@ -277,10 +263,10 @@ def _expected(u: Array, waveform: Waveform, like: Data, measured: FrequencyRespo
     how = "from the designed signal"
     if expansion.feedback:
         how = (f"from the designed signal and outputs predicted through the frequency response of "
-               f"{like.name or 'the record'} ({measured.segments} segments) with its disturbance; a plant that is far "
+               f"{like.name or 'the record'} ({segments} segments) with its disturbance; a plant that is far "
                "from linear will differ")
-    return Excitation(u, like.dt, like.inputs, waveform.kind, condition, rows, expansion.p + expansion.q,
-                      waveform.band, tuple(float(s) for s in y.std(axis=0)), checks, how, like.time_unit)
+    return Excitation(record.u, like.dt, like.inputs, waveform.kind, condition, rows, expansion.p + expansion.q,
+                      waveform.band, tuple(float(s) for s in record.y.std(axis=0)), checks, how, like.time_unit)
 
 
 def _predicted(u: Array, like: Data, measured: FrequencyResponse, seed: int) -> Array:

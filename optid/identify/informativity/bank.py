@@ -97,16 +97,21 @@ def _weights(p: Array, q: Array) -> Array:
     return np.stack([p * (1 - q) / (p - q), -q * (1 - p) / (p - q)])
 
 
-def apart(regression: WhitenedRegression, inputs: Sequence[Array], least: int, longest: int
-          ) -> list[tuple[Array, ...]]:
+def responses(signals: Sequence[Array], taus: Sequence[float], delays: Sequence[int], least: int, longest: int
+              ) -> Array:
+    """Return signals (T,) behind poles of so many time constants after so many delays, from `least` to `longest`."""
+    lags = sorted({max(lag, least) for lag in delays if lag <= max(longest, least)})
+    behind = [respond((float(np.exp(-1 / tau)),), one) for one in signals for tau in taus]
+    return np.column_stack([delay(v, lag) for v in behind for lag in lags])
+
+
+def apart(regression: WhitenedRegression, inputs: Sequence[Array], least: int, longest: int) -> list[tuple[Array, ...]]:
     """Return a first response to each of several inputs, fitted together behind a few poles and delays.
 
     The inputs are (T, m) per experiment; the responses, (T,) per experiment, are those of powers of the input.
     """
-    lags = sorted({max(lag, least) for lag in DELAYS if lag <= max(longest, least)})
-    columns = [[np.column_stack([delay(v, lag) for power in POWERS for tau in TAUS
-                                 for v in (respond((float(np.exp(-1 / tau)),), u[:, c] ** power),) for lag in lags])
-                for u in inputs] for c in range(inputs[0].shape[1])]
+    columns = [[responses([u[:, c] ** power for power in POWERS], TAUS, DELAYS, least, longest) for u in inputs]
+               for c in range(inputs[0].shape[1])]
     both, _ = regression.project_columns([np.hstack(several) for several in zip(*columns)], 1.0)
     size = np.linalg.norm(both[:, :-1], axis=0) + 1e-300
     x = both[:, :-1] / size

@@ -5,11 +5,12 @@ are few: in doubt its law without an effect is simulated (parametric bootstrap).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.identify.informativity.bank import responses
 from optid.identify.informativity.lags import lag_columns, memory, powers, stack_experiments, test_addition
 from optid.identify.informativity.process import LATEST, DelayedResponse, Process
 from optid.identify.informativity.signals import RecordSignals, WhitenedRegression, delay, respond
@@ -102,21 +103,18 @@ def _without_effect(signals: RecordSignals, o: int, outputs: tuple[Array, ...], 
         _, pole, theta = min(found, key=lambda one: one[0])
         errors = regression.residuals([x[:, 1:] for x in others], theta, pole)
         smooth = [y - np.nan_to_num(e) for y, e in zip(outputs, errors)]
-        regression = regression.with_noise(short_autoregression(errors, min(12, signals.samples // SAMPLES)))
+        regression = replace(regression, noise=short_autoregression(errors, min(12, signals.samples // SAMPLES)))
     _, _, white, _ = regression.solve([x[:, 1:] for x in others], pole)
     return smooth, regression.noise, float(np.std(white))
 
 
 def _bank(x: Array, levels: int, least: int, latest: int) -> Array:
     """Return an input, and its square, behind a few poles after a few delays."""
-    lags = sorted({max(lag, least) for lag in DELAYS if lag <= max(latest, least)})
-    responses = [respond((float(np.exp(-1 / tau)),), one) for one in powers(x, levels, 2) for tau in TAUS]
-    return np.column_stack([delay(v, lag) for v in responses for lag in lags])
+    return responses(powers(x, levels, 2), TAUS, DELAYS, least, latest)
 
 
 def _others(x: Array, response: DelayedResponse, least: int, latest: int) -> Array:
     """Return the past of another input: its bank, first lags, and response."""
     first = [delay(x - x[0], least + j) for j in range(LAGS)]
     shaped = respond(response.poles, x)
-    return np.column_stack([_bank(x, 1, least, latest), *first,
-                            *(delay(shaped, response.nk + j) for j in range(2))])
+    return np.column_stack([_bank(x, 1, least, latest), *first, *(delay(shaped, response.nk + j) for j in range(2))])

@@ -71,11 +71,6 @@ class DelayedResponse:
         rest = float(np.real(np.prod(1 - self.poles)))
         return float(self.b.sum() / rest) if rest else float(np.copysign(np.inf, self.b.sum()))
 
-    @property
-    def a(self) -> Array:
-        """Coefficients (n,) of A after the leading one."""
-        return np.real(np.poly(self.poles))[1:] if self.poles.size else np.zeros(0)
-
 
 @dataclass(frozen=True, eq=False)
 class Process:
@@ -121,7 +116,7 @@ def _process(signals: RecordSignals, o: int, name: str, least: int, known: Proce
     points: list[FittedTerm | None] = [None] * len(u)
     if known is not None and len(u) > 1:
         points = [p if p.term.lag >= least else None for p in known.points]
-        regression = regression.with_noise(known.noise)
+        regression = replace(regression, noise=known.noise)
     inputs = range(1) if len(u) == 1 else sorted(  # the one that explains most first
         range(len(u)), key=lambda c: next(scan(regression, u[c], longest, False))[0].energy)
     whole = not any(lost.any() for lost in signals.lost)
@@ -147,7 +142,7 @@ def _process(signals: RecordSignals, o: int, name: str, least: int, known: Proce
         exact = all(p.energy <= EXACT * regression.count for p in found)
         if exact or np.max(np.abs(change)) < SETTLED and (same or (turn == 0 and whole)):
             break
-        regression = regression.with_noise(noise)
+        regression = replace(regression, noise=noise)
     spread = float(np.nanvar(np.concatenate(errors)))
     energy = float(np.mean(np.concatenate([(y - y.mean()) ** 2 for y in regression.y])))
     scale = float(signals.y_scale[o])
@@ -346,8 +341,7 @@ def _interval(regression: WhitenedRegression, point: FittedTerm, least: int, lon
             there = lag + sign * step
             found = refine_poles(regression, point.drive,
                                  replace(term, lag=there)) if least <= there <= longest else None
-            if found is None or regression.count * np.log(
-                    max(found.energy, floor) / max(point.energy, floor)) > LIKELY:
+            if found is None or regression.count * np.log(max(found.energy, floor) / max(point.energy, floor)) > LIKELY:
                 step, grows = step // 2, False
             else:
                 lag, term, step = there, found.term, 2 * step if grows else step // 2

@@ -185,10 +185,6 @@ class WhitenedRegression:
     present: tuple[NDArray[np.bool_], ...]
     noise: Array
 
-    def with_noise(self, noise: Array) -> "WhitenedRegression":
-        """Return the regression with another noise model."""
-        return replace(self, noise=noise)
-
     @cached_property
     def rows(self) -> tuple[NDArray[np.bool_], ...]:
         """Rows whose whitened error can be formed."""

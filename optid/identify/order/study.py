@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -151,7 +151,7 @@ def with_simulated_outputs(records: Sequence[Array], expansion: Expansion, alpha
         for i in range(rows):
             simulated[rows - 1 :] += eta[i : i + count] @ weights[i]
         extended.append(np.hstack([record[:, : m + expansion.l], simulated]))
-    return extended, expansion.with_simulated()
+    return extended, replace(expansion, simulated=True)
 
 
 def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Data | None, Data | None]:

@@ -6,6 +6,7 @@ function of two poles, everything else fitted again, tell whether there is a bet
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from optid.statistics.linearised import linearise_errors
 
 # shares of the imaginary part of a pair that are tried
 SHARES = (0.03, 0.2, 0.5, 0.8, 0.95, 0.99, 0.999, 1.0, 1.001, 1.01, 1.05, 1.25, 2.0)
+SHIFTS = (-0.01, -1e-3, 1e-3, 0.01)  # of the mean of two poles, or of one of them, that are tried inside
 APART = (1e-3, 0.01, 0.05, 0.2)  # half the distances that two real poles, or a pair nearly so, are tried at
 LEAST = 5e-5  # imaginary part of a pair, at least: a double pole is hardly better
 NEARLY = 0.05  # imaginary part below which a pair may become two real poles
@@ -79,8 +81,7 @@ def along_border(criterion: Criterion, depth: Callable[[Array], float], x: Array
                 point, least = fit_rest(x)
             best = point if is_allowed(poles) and least < criterion.value(x) * (1 - share) else None
             least *= 1 - share if is_allowed(poles) else 1 + share  # a rounding outside, the border is as good
-        for pair in _couples(poles):
-            two, others = poles[list(pair)], np.delete(poles, pair)
+        for two, others in _couples(poles):
             for mean, square in _moves(two, is_allowed) if depth(others) >= -OUTSIDE else ():
                 point, value = fit_rest(_moved(criterion, x, two, others, mean, square))
                 if value < least:
@@ -97,31 +98,37 @@ def poles_of(criterion: Criterion, x: Array) -> Any:
     return np.linalg.eigvals(part) if part.ndim == 2 else roots_of(part)
 
 
+def creeps(criterion: Criterion, x: Array) -> bool:
+    """Whether the slowest pole acts longer than an experiment."""
+    if criterion.dynamics not in criterion.unknowns.slices:
+        return False
+    slowest = float(np.abs(poles_of(criterion, x)).max())
+    return slowest > 1 - 1 / max(e.n_samples for e in criterion.data.experiments)
+
+
 def _on_border(poles: Array, allowed: Callable[[Array], bool]) -> bool:
     turns = np.exp(2j * np.pi * np.arange(8) / 8)
     return any(not allowed(np.array([pole + ON * turn, np.conj(pole + ON * turn)])) for pole in poles for turn in turns)
 
 
-def _couples(poles: Array) -> Iterator[tuple[int, int]]:
-    """Yield the places of every pair, and of every two neighbouring real poles."""
+def _couples(poles: Array) -> Iterator[tuple[Array, Array]]:
+    """Yield every two neighbouring real poles, and every pair, with the other poles."""
     real = sorted((i for i in range(len(poles)) if abs(poles[i].imag) <= 1e-12), key=lambda i: poles[i].real)
-    yield from zip(real[:-1], real[1:])
-    for i in range(len(poles)):
-        if poles[i].imag > 1e-12:
-            yield i, int(np.argmin(np.abs(poles - np.conj(poles[i]))))
+    pairs = [(i, int(np.argmin(np.abs(poles - np.conj(poles[i]))))) for i in range(len(poles)) if poles[i].imag > 1e-12]
+    for couple in (*zip(real[:-1], real[1:]), *pairs):
+        yield poles[list(couple)], np.delete(poles, couple)
 
 
 def _moves(two: Array, allowed: Callable[[Array], bool]) -> Iterator[tuple[float, float]]:
     """Yield means m and squares s of two poles m +- sqrt(s) that lie on the border, and of some near them inside."""
     mean, apart = float(np.mean(two).real), float(abs(two[0].imag))
     now = float(np.real((two[0] - two[1]) ** 2)) / 4
-    for shift in (-0.01, -1e-3, 1e-3, 0.01):
-        for square in (now, 0.9 * now, 1.1 * now):
-            root = np.sqrt(complex(square))
-            if allowed(np.array([mean + shift + root, mean + shift - root])):
-                yield mean + shift, square
+    for shift, square in product(SHIFTS, (now, 0.9 * now, 1.1 * now)):
+        root = np.sqrt(complex(square))
+        if allowed(np.array([mean + shift + root, mean + shift - root])):
+            yield mean + shift, square
     for stays, moves in ((two[0], two[1]), (two[1], two[0])) if not apart else ():
-        for shift in (-0.01, -1e-3, 1e-3, 0.01):
+        for shift in SHIFTS:
             if allowed(np.array([stays, moves + shift])):
                 yield float((stays + moves + shift).real) / 2, float((stays - moves - shift).real) ** 2 / 4
     squares = [-max(share * apart, LEAST) ** 2 for share in SHARES] if apart else [-gap**2 for gap in (LEAST, *APART)]
@@ -185,9 +192,7 @@ def meet(criterion: Criterion, x: Array) -> bool:
 
 def with_double_pole(criterion: Criterion, depth: Callable[[Array], float], x: Array) -> Array | None:
     """Return x with the first pair near the real axis made an all but double pole on the border; None without one."""
-    poles = poles_of(criterion, x)
-    for pair in _couples(poles):
-        two, others = poles[list(pair)], np.delete(poles, pair)
+    for two, others in _couples(poles_of(criterion, x)):
         if LEAST < abs(two[0].imag) < NEARLY:
             mean = _on(float(np.mean(two).real), -(LEAST**2), lambda one: depth(one) >= -ROUNDING)
             return None if mean is None else _moved(criterion, x, two, others, mean, -(LEAST**2))
@@ -200,9 +205,8 @@ def with_slow_poles(criterion: Criterion, x: Array) -> list[Array]:
     With a slow pole the static gain, which words about f refer to, may oppose the first response. A pair that rings
     through the record amplifies what f leaves, and keeps its frequency.
     """
-    poles, slow = poles_of(criterion, x), float(np.exp(-SLOW / max(e.n_samples for e in criterion.data.experiments)))
-    for pair in _couples(poles):
-        two, others = poles[list(pair)], np.delete(poles, pair)
+    slow = float(np.exp(-SLOW / max(e.n_samples for e in criterion.data.experiments)))
+    for two, others in _couples(poles_of(criterion, x)):
         fast = float(np.mean(two).real) if two[0].imag else float(two[0].real)
         moves = [((fast + slow) / 2, ((slow - fast) / 2) ** 2)] if fast < slow else []
         if two[0].imag and abs(two[0]) < slow:

@@ -1,4 +1,7 @@
-"""A sum of squared errors in a vector of unknowns, and the named variables that are its parts."""
+"""A sum of squared errors in a vector of unknowns, and the convex problem of a step of a fit that lowers it.
+
+The problem of the fit has one term, `optid.core.terms.Errors`, with its criterion.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -11,12 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.core.judge import largest_excess
 from optid.core.leaves import Product
-from optid.core.terms import Squares, Values, flat
+from optid.core.problem import Problem
+from optid.core.terms import Errors, Squares, Values, flat
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.statistics.linearised import Linearised, Method
 from optid.statistics.unknowns import Unknowns
+
+INSIDE = 1e-6  # relative violation up to which a point satisfies the constraints
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,26 +31,20 @@ class Places:
     """Named variables, and where each stands in the vector of the unknowns of errors."""
 
     criterion: "Criterion"  # the errors
-    names: Mapping[str, str]  # {variable: part of the vector}, in its order; "x0" is the initial states
 
-    @classmethod
-    def of(cls, criterion: "Criterion") -> "Places":
-        """Name the parts by the keys of a criterion."""
-        found, unknowns = {}, criterion.unknowns
+    @cached_property
+    def names(self) -> dict[str, str]:
+        """{variable: part of the vector}, in its order, named by the keys of the criterion; "x0": initial states."""
+        found, unknowns = {}, self.criterion.unknowns
         for part, shape in unknowns.shapes.items():
             kind = part.rstrip("0123456789")
             if np.prod(shape):
-                found[part if kind == part else criterion.key(kind, int(part[len(kind) :]))] = part
-        return cls(criterion, {**found, "x0": "x0"} if unknowns.memory else found)
-
-    @property
-    def unknowns(self) -> Unknowns:
-        """The order of the vector."""
-        return self.criterion.unknowns
+                found[part if kind == part else self.criterion.key(kind, int(part[len(kind) :]))] = part
+        return {**found, "x0": "x0"} if unknowns.memory else found
 
     def values(self, x: Array) -> dict[str, Array]:
         """Name the parts of x; initial states are (n,), or (n, experiments)."""
-        unknowns, parts = self.unknowns, self.unknowns.parts(x)
+        unknowns, parts = self.criterion.unknowns, self.criterion.unknowns.parts(x)
         states = x[unknowns.shared :].reshape(unknowns.experiments, unknowns.memory).T
         parts["x0"] = states if unknowns.experiments > 1 else states[:, 0]
         return {name: parts[part] for name, part in self.names.items()}
@@ -73,7 +74,7 @@ class Places:
     @cached_property
     def columns(self) -> NDArray[np.intp]:
         """Where in the vector the entries of the variables are, one after another, each column by column."""
-        places = self.values(np.arange(self.unknowns.size, dtype=float))
+        places = self.values(np.arange(self.criterion.unknowns.size, dtype=float))
         return np.concatenate([flat(one) for one in places.values()]).astype(np.intp)
 
 
@@ -92,7 +93,7 @@ class Criterion(ABC):
     @cached_property
     def variables(self) -> Places:
         """The named variables, and where each stands in x."""
-        return Places.of(self)
+        return Places(self)
 
     def facts(self) -> dict[str, Any]:
         """Return what constraints may ask besides named expressions: keyword arguments of a `View`."""
@@ -198,3 +199,27 @@ class Criterion(ABC):
             else:  # a channel without effect: any direction will do
                 x[at[mu]], x[at[b]] = 0.0, 1 / np.sqrt(x[at[b]].size)
         return x
+
+
+def criterion_of(problem: Problem) -> Criterion:
+    """Return the errors of a fit, in the gauge of its problem."""
+    (term,) = problem.terms
+    assert isinstance(term, Errors)
+    return term.criterion
+
+
+def step_problem(problem: Problem, x: Array, at: Linearised, damping: float) -> Problem:
+    """Return the problem of the step from x, ``at`` the errors near x."""
+    criterion = criterion_of(problem)
+    compressed, places = criterion.compressed_near(at, x), criterion.variables
+    root, target, remainder = compressed.problem
+    if damping:
+        sizes = np.sqrt(damping) * np.linalg.norm(at.whole[0], axis=0)
+        root, target = np.vstack([root, np.diag(sizes)]), np.append(target, sizes * x)
+    squares = Squares(root[:, places.columns], target, remainder, tuple(places.names))
+    return problem.tangent(places.values(x), squares, compressed)
+
+
+def excess(problem: Problem, x: Array, unknowns: frozenset[str] = frozenset()) -> float:
+    """Return the largest relative violation of the constraints, or of those about some unknowns alone."""
+    return largest_excess(problem, criterion_of(problem).variables.values(x), unknowns)

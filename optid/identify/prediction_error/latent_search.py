@@ -6,17 +6,18 @@ with a part of their samples.
 """
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 
-from optid.arrays import Array
-from optid.bases import BSpline, Linear
+from optid.arrays import LARGEST_INTEGER, Array, check_integer, one_of, short_repr
+from optid.bases import Basis, BSpline, Linear, Polynomial, parse
 from optid.data.record import Data
-from optid.errors import DataError, DataWarning, RankError
+from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.identify.arguments import outputs_present
 from optid.identify.prediction_error.descent import COMPARED, Descent, descend
 from optid.identify.prediction_error.latent_directions import MARGIN, directions
@@ -37,6 +38,36 @@ LEFT = 0.1  # share of the errors by one more function, from which the search is
 PACE = {"search": 1e-2, "long": 3e-3, "short": 0.0}
 SIZES = (1.0, 0.3, 0.05)  # shares of the Gauss-Newton step from which a descent may start
 SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.0)  # sizes of a function where a longer record would leave its range
+Extend = Callable[..., Any]  # see `optid.identify.prediction_error.state_fit.fit_states`
+
+
+def latent_channels(channels: int, latent_basis: Any, latent: str, direct: bool, seed: int, iterations: int,
+                    tries: int) -> Extend:
+    """Return what adds the latent signals of `formulations.latent_signals.lfr`; arguments and errors as there."""
+    check_integer(channels, "channels")
+    check_integer(seed, "seed", 0, LARGEST_INTEGER)
+    one_of("latent", latent, ("states+inputs", "states"))
+    inner = _on_latent(latent_basis)
+    one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
+    return partial(add_channels, channels=(one,) * channels, seed=seed, iterations=iterations,
+                   tries=check_integer(tries, "tries", 0))
+
+
+def output_functions(basis: Any, outputs: int, moved: bool, iterations: int) -> Extend:
+    """Return what puts a function in a basis in the place of every output, moved by inputs at once or not."""
+    inner = _on_latent(basis)
+    functions = tuple(Latent(inner, np.eye(inner.size), feeds=False, output=o, moved=moved) for o in range(outputs))
+    return partial(add_output_functions, functions=functions, iterations=iterations)
+
+
+def _on_latent(given: Basis | str) -> Basis:
+    """Return the basis of a latent function, on [-1, 1]."""
+    basis = parse(given) if isinstance(given, str) else given
+    if not isinstance(basis, Basis):
+        raise StructureError(f"the basis of a latent signal is {short_repr(given)}: give one such as Polynomial(3) or "
+                             "its name, 'polynomial:3'")
+    outside = "extrapolate" if isinstance(basis, Polynomial) else "linear"
+    return replace(cast(Any, basis), interval=(-1.0, 1.0), outside=outside)
 
 
 def add_channels(errors: StateErrors, best: Descent, known: Sequence[HammersteinSS], channels: tuple[Latent, ...], *,

@@ -1,4 +1,4 @@
-"""The search for the best optimum of a transfer-function model over starts of many kinds, and the entry to constraints.
+"""A fit of a transfer function: the search for the best optimum over starts of many kinds, and its confirmation.
 
 Starts of the plant: equation error, Steiglitz-McBride, refined instruments, subspace, perturbed poles. Poles outside
 the unit circle are reflected into it, and the other unknowns fitted by a few steps with A fixed. With a noise model:
@@ -14,19 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import LARGEST_INTEGER, Array, check_integer
 from optid.bases import Linear, fitted_bases
 from optid.core.problem import Problem
 from optid.data.record import Data
 from optid.data.stretches import interpolate_missing
 from optid.errors import DataWarning, OptidError, RankError
+from optid.identify.arguments import enough_rows
+from optid.identify.prediction_error.criterion import excess
 from optid.identify.prediction_error.descent import Descent, agreement, best_of, descend, with_poles
 from optid.identify.prediction_error.signs import with_required_signs
-from optid.identify.prediction_error.tangent_problem import excess
+from optid.identify.prediction_error.tangent_descent import refine
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.identify.subspace.projection import project, realise
 from optid.models.layout import Layout
 from optid.models.roots import contain_roots, roots_of, with_integrator, with_roots
+from optid.solving.solve import Procedure
 from optid.statistics.expansion import expand
 from optid.statistics.experiments import collect_by_experiment
 from optid.statistics.hankel import hankel_statistics
@@ -45,6 +48,28 @@ WIDE = 6  # functions, over all inputs, up to which the subspace start is used
 RADIUS = 0.98  # largest modulus of the poles of a start
 MORE = 8  # lags of a long model beyond those of the model whose innovations it approximates
 PLANTS = 4  # starts, at most, of the output-error fit whose plant is the start of a Box-Jenkins model
+
+
+def fit_transfer(errors: TransferErrors, starts: int, seed: int, pose: Callable[[Array], Problem]) -> Procedure:
+    """Search for the best optimum in a gauge that is always reached, and continue from there in that of the errors.
+
+    Args:
+        errors: the criterion.
+        starts: number of starts.
+        seed: of the random ones.
+        pose: states the problem of the fit from the optimum, whose values have usual sizes.
+
+    Raises:
+        StructureError: numbers that are none.
+        RankError: too few samples for the unknowns.
+    """
+    check_integer(starts, "starts")
+    check_integer(seed, "seed", 0, LARGEST_INTEGER)
+    free = errors if errors.gauge == "none" else replace(errors, gauge="norm")
+    best, others, figures = search(free, lambda part: starts_of(part, starts, seed))
+    enough_rows(best.at.rows, errors.errors, errors.unknowns.size, "lags")
+    problem = pose(errors.normalise(best.x))
+    return (yield from refine(problem, best, figures, entry(problem, free, [best, *others])))
 
 
 def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterable[tuple[str, Array]]]
@@ -67,11 +92,9 @@ def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterabl
             break
         found.sort(key=lambda one: one.rank)
     agreed, sentence = agreement(found, 1e-12 * part.energy)
-    figures: dict[str, Any] = {"starts": sentence}
-    if filtered:
-        figures["starts that agree"] = agreed
-    figures[f"{criterion.errors} of the starts"] = criterion.unit * np.array(
-        sorted((one.value for one in found), reverse=True))
+    values = criterion.unit * np.sort([one.value for one in found])[::-1]
+    figures = {"starts": sentence, **({"starts that agree": agreed} if filtered else {}),
+               f"{criterion.errors} of the starts": values}
     others = [one for one in found[1:] if abs(one.value - best.value) > 1e-3 * best.value] if part is criterion else []
     return replace(final, steps=final.steps + best.steps), others, figures
 
@@ -353,8 +376,7 @@ def _guess(unknowns: TransferUnknowns) -> TransferPoint:
     layout, mus = unknowns.layout, []
     for basis, free in zip(layout.bases, unknowns.free):
         points = basis.grid()
-        line = np.linalg.lstsq(basis.values(points), points - points.mean(), rcond=None)[0]
-        mus.append(line if free else np.ones(1))
+        mus.append(np.linalg.lstsq(basis.values(points), points - points.mean())[0] if free else np.ones(1))
     bs = tuple(np.full(nb, 1 / np.sqrt(nb)) for nb in layout.nb)
     a = with_roots(np.full(layout.na, 0.5), layout.na)
     return TransferPoint(a, tuple(mus), bs, 0.0, np.zeros((unknowns.experiments, unknowns.memory)))

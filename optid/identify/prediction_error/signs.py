@@ -6,8 +6,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.core.problem import Problem
-from optid.identify.prediction_error.criterion import Criterion
-from optid.identify.prediction_error.tangent_problem import INSIDE, criterion_of, excess
+from optid.identify.prediction_error.criterion import INSIDE, Criterion, criterion_of, excess
 
 
 def with_required_signs(problem: Problem, x: Array) -> Array:
@@ -22,15 +21,10 @@ def sign_variants(problem: Problem, x: Array, same: bool = False) -> Iterator[Ar
     descriptions of one function are the same to constraints that speak about it alone.
     """
     criterion, told = criterion_of(problem), problem.fixes_signs
-    at, pairs = criterion.unknowns.slices, [(1, -1), (-1, 1)] if told else [(1, -1)]
-    if same:
-        pairs = [(-1, -1)] if told else []
-    for mu, b in criterion.unknowns.products if criterion.gauge == "norm" else ():
-        for mu_sign, b_sign in pairs if mu.startswith("mu") else ():
-            turned = np.array(x)
-            turned[at[mu]] *= mu_sign
-            turned[at[b]] *= b_sign
-            yield turned
+    signs = [(1, -1), *[(-1, 1)] * told] if not same else [(-1, -1)] * told
+    for mu, b in _products(criterion):
+        for pair in signs if mu.startswith("mu") else ():
+            yield _turned(criterion, x, (mu, b), pair)
 
 
 def input_signs(problem: Problem, x: Array) -> Array:
@@ -39,12 +33,10 @@ def input_signs(problem: Problem, x: Array) -> Array:
     1 for the others; (m,). A descent under constraints may end with other signs than it began with.
     """
     criterion = criterion_of(problem)
-    at, found = criterion.unknowns.slices, np.ones(criterion.data.m)
-    for mu, b in criterion.unknowns.products if problem.builders and criterion.gauge == "norm" else ():
+    found = np.ones(criterion.data.m)
+    for mu, b in _products(criterion) if problem.builders else ():
         if mu.startswith("mu") and criterion.gain_sign(x, b) < 0:
-            turned = np.array(x)
-            turned[at[mu]], turned[at[b]] = -x[at[mu]], -x[at[b]]
-            found[int(b[1:])] = -1.0 if excess(problem, turned) <= INSIDE else 1.0
+            found[int(b[1:])] = -1.0 if excess(problem, _turned(criterion, x, (mu, b), (-1, -1))) <= INSIDE else 1.0
     return found
 
 
@@ -54,21 +46,30 @@ def with_signs(criterion: Criterion, x: Array, outside: Callable[[Array], float]
     A monotone f or a sign of the gain says which of the two equal descriptions is meant; where it asks for the opposite
     characteristic, mu or b alone is turned, since no tangent step leads through zero.
     """
-    x, at = criterion.normalise(x), criterion.unknowns.slices
-    for mu, b in criterion.unknowns.products if criterion.gauge == "norm" else ():
+    x = criterion.normalise(x)
+    for mu, b in _products(criterion):
         if mu.startswith("nu"):  # the signs of feedback functions stay
             continue
         best, chosen = np.inf, x
         first = criterion.gain_sign(x, b)
         signs = (first, first), (-first, -first), (-first, first), (first, -first)
-        for mu_sign, b_sign in signs if mu.startswith("mu") else signs[:2]:
-            turned = np.array(x)
-            turned[at[mu]] *= mu_sign
-            turned[at[b]] *= b_sign
+        for pair in signs if mu.startswith("mu") else signs[:2]:
+            turned = _turned(criterion, x, (mu, b), pair)
             amount = 0.0 if outside is None else outside(turned)
-            if amount < (best if mu_sign == b_sign else 0.5 * best):
+            if amount < (best if pair[0] == pair[1] else 0.5 * best):
                 best, chosen = amount, turned
             if best <= 1e-9:
                 break
         x = chosen
     return x
+
+
+def _products(criterion: Criterion) -> tuple[tuple[str, str], ...]:
+    return criterion.unknowns.products if criterion.gauge == "norm" else ()
+
+
+def _turned(criterion: Criterion, x: Array, product: tuple[str, str], signs: tuple[float, float]) -> Array:
+    turned = np.array(x)
+    for part, sign in zip(product, signs):
+        turned[criterion.unknowns.slices[part]] *= sign
+    return turned

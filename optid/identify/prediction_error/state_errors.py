@@ -213,16 +213,14 @@ class StateErrors(Criterion):
     def _placed(self, x: Array) -> tuple[StatePoint, HammersteinSS]:
         """Return the point and the model at x; the last ones are kept, since every step asks twice."""
         key = x.tobytes()
-        kept = self._last.get(key)
-        if kept is None:
+        if key not in self._last:
             point = self.unknowns.unpack(x)
             model = self.at(point)
             if self.unknowns.levels:  # the constants are states of the run
                 model = replace(model, offset_y=np.zeros(model.l)).with_level_states
-            kept = point, model
             self._last.clear()
-            self._last[key] = kept
-        return kept
+            self._last[key] = point, model
+        return self._last[key]
 
     @cached_property
     def _last(self) -> dict[bytes, tuple[StatePoint, HammersteinSS]]:

@@ -16,19 +16,11 @@ import numpy as np
 from optid.arrays import Array
 from optid.core.problem import Problem
 from optid.errors import RankError, StructureError
-from optid.identify.prediction_error.border import (
-    about_poles,
-    along_border,
-    meet,
-    poles_of,
-    with_double_pole,
-    with_slow_poles,
-)
-from optid.identify.prediction_error.criterion import Criterion
+from optid.identify.prediction_error import border
+from optid.identify.prediction_error.criterion import INSIDE, criterion_of, excess, step_problem
 from optid.identify.prediction_error.curvature import Curvature, measure_curvature
 from optid.identify.prediction_error.descent import STEPS, Descent
 from optid.identify.prediction_error.signs import input_signs, sign_variants
-from optid.identify.prediction_error.tangent_problem import INSIDE, criterion_of, excess, step_problem, under
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
 from optid.statistics.linearised import CONDITION_LIMIT, Linearised
@@ -79,13 +71,15 @@ def refine(problem: Problem, found: Descent, figures: Mapping[str, Any], x: Arra
     if here.tangent.constraint_names:
         # how well the record tells the unknowns: a constraint that it contradicts may end where f is all but flat
         figures["condition"] = found.at.condition
-        free = criterion_of(problem).unit * found.value
+        criterion = criterion_of(problem)
+        free = criterion.unit * found.value
         best = yield from _best_signed(here, free, figures)
         if best is None:
             return None
         easy = best.objective <= free * (1 + CONFLICT) and found.at.condition < CONDITION_LIMIT
         end = yield from _settled(problem, best, figures, easy)
-        return replace(end, reason=CREEPS) if end.status is Status.LIMIT and _creeps(problem, end) else end
+        creeps = end.status is Status.LIMIT and border.creeps(criterion, criterion.variables.pack(end.values or {}))
+        return replace(end, reason=CREEPS) if creeps else end
     solution = yield here.tangent
     if not solution.has_point:
         return None
@@ -101,16 +95,16 @@ def _settled(problem: Problem, end: Evidence, figures: Mapping[str, Any], easy: 
     everything else fitted, then say that a point is the best one near it, if nothing else is constrained.
     """
     criterion = criterion_of(problem)
-    depth, tried = about_poles(problem.builders), False
+    depth, tried = border.about_poles(problem.builders), False
     alone = all("poles" in getattr(rule, "about", ()) for rule in problem.builders)
     for _ in range(ROUNDS):
         if end.status not in (Status.LOCAL, Status.LIMIT, Status.INACCURATE):
             break
         best = before = criterion.variables.pack(end.values or {})
         if depth is not None:
-            best = along_border(criterion, depth, before, ALONG, alone)
+            best = border.along_border(criterion, depth, before, ALONG, alone)
             if not alone:
-                moved = with_double_pole(criterion, depth, before), best
+                moved = border.with_double_pole(criterion, depth, before), best
                 best = yield from _beside_others(problem, before, moved, figures)
                 tried = True
         on_border = best is not before
@@ -126,7 +120,7 @@ def _settled(problem: Problem, end: Evidence, figures: Mapping[str, Any], easy: 
                 or again.objective < least * (1 - WORTH)):
             end = again  # on the way, if not there
             continue
-        two = alone and depth is not None and meet(criterion, best)
+        two = alone and depth is not None and border.meet(criterion, best)
         two = two and (yield from _along_valley(problem, best)) is best
         gains = criterion.unit * there.at.value < end.objective * (1 - BETTER)
         if end.status is Status.LOCAL and not gains and not two:
@@ -140,15 +134,6 @@ def _settled(problem: Problem, end: Evidence, figures: Mapping[str, Any], easy: 
     if tried:  # prices are those of the last programme
         yield _end_of(problem, end).tangent
     return end
-
-
-def _creeps(problem: Problem, end: Evidence) -> bool:
-    """Whether the slowest pole of an end that has not arrived acts longer than an experiment."""
-    criterion = criterion_of(problem)
-    longest = max(e.n_samples for e in criterion.data.experiments)
-    known = criterion.dynamics in criterion.unknowns.slices
-    poles = poles_of(criterion, criterion.variables.pack(end.values or {})) if known else np.zeros(1)
-    return float(np.abs(poles).max()) > 1 - 1 / longest
 
 
 def _along_valley(problem: Problem, x: Array) -> Generator[Problem, Solution, Array]:
@@ -191,7 +176,8 @@ def _with_poles(problem: Problem, x: Array, rules: tuple[Any, ...], figures: Map
     """Fit everything but the poles of x again, under rules."""
     criterion = criterion_of(problem)
     word, part = criterion.dynamics, criterion.unknowns.parts(x)[criterion.dynamics]
-    still = under(problem, rules, lambda view: {"poles": view[word] == part})
+    held = *problem.restrictions, lambda view: {"poles": view[word] == part}
+    still = replace(problem, builders=rules, restrictions=held)
     return (yield from _constrained(_Iterate.of(still, x), figures, MOVED))
 
 
@@ -204,11 +190,6 @@ class _Iterate:
     outside: float  # largest violation, relative
     amount: float  # sum of the absolute violations of the user's constraints
 
-    @property
-    def criterion(self) -> Criterion:
-        """The errors."""
-        return criterion_of(self.problem)
-
     @classmethod
     def of(cls, problem: Problem, x: Array) -> "_Iterate":
         criterion = criterion_of(problem)
@@ -220,7 +201,7 @@ class _Iterate:
 
     def move_to(self, x: Array) -> "_Iterate | None":
         """Return the iterate at x, None where it is inadmissible, its run explodes or its gauge cannot be reached."""
-        criterion = self.criterion
+        criterion = criterion_of(self.problem)
         x = criterion.confine(x)
         try:
             return _Iterate.of(self.problem, x) if criterion.admissible(x) and np.isfinite(criterion.value(x)) else None
@@ -231,7 +212,7 @@ class _Iterate:
         return self.at.value + weight * self.amount
 
     def step(self, solution: Solution) -> Array:
-        return self.criterion.variables.pack(solution.values) - self.x
+        return criterion_of(self.problem).variables.pack(solution.values) - self.x
 
     def gain(self, step: Array, at: Linearised | None = None) -> float:
         """By how much a step lowers the sum of squares of the linear errors, or of others with the same gradient."""
@@ -239,7 +220,7 @@ class _Iterate:
         return at.value - at.after(step)
 
     def negligible(self, gain: float, share: float) -> bool:
-        return abs(gain) <= share * self.at.value + ROUNDING * self.criterion.energy
+        return abs(gain) <= share * self.at.value + ROUNDING * criterion_of(self.problem).energy
 
     def judge(self, solution: Solution, share: float) -> tuple[Status, str]:
         """What an answer to the programme makes of the iterate: it must have been solved, and the iterate stay."""
@@ -247,16 +228,16 @@ class _Iterate:
             return solution.status, solution.reason
         gain = self.gain(self.step(solution))
         if self.negligible(gain, share):
-            return Status.LOCAL, NO_BOUND.format(self.criterion.errors)
+            return Status.LOCAL, NO_BOUND.format(criterion_of(self.problem).errors)
         return Status.INACCURATE, (f"{solution.solver} moves the sum of squares of the last tangent programme by "
                                    f"{abs(gain) / max(self.at.value, 1e-300):.0e} of its value")
 
     def evidence(self, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
-        bound = Bound.none(NO_BOUND.format(self.criterion.errors))
-        values, value = self.criterion.variables.values(self.x), self.criterion.unit * self.at.value
-        model, turns = self.problem.model(values), input_signs(self.problem, self.x)
+        criterion, turns = criterion_of(self.problem), input_signs(self.problem, self.x)
+        bound, values = Bound.none(NO_BOUND.format(criterion.errors)), criterion.variables.values(self.x)
+        model = self.problem.model(values)
         model = model.with_signs(turns) if np.any(turns < 0) else model
-        return Evidence(model, value, bound, status, reason, figures, values=values)
+        return Evidence(model, criterion.unit * self.at.value, bound, status, reason, figures, values=values)
 
 
 def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Procedure:
@@ -265,12 +246,12 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
     Constraints that the record contradicts have several local optima; near the free optimum there is one. A slow pole
     is another way to the characteristic that they ask for, and so are the poles of the free optimum, held at first.
     """
-    problem, criterion = here.problem, here.criterion
+    problem, criterion = here.problem, criterion_of(here.problem)
     best = yield from _constrained(here, figures)
     if best is not None and best.objective <= free * (1 + CONFLICT):
         return best
-    known = about_poles(problem.builders) or criterion.dynamics not in criterion.unknowns.slices
-    slow = [] if known else with_slow_poles(criterion, here.x)
+    known = border.about_poles(problem.builders) or criterion.dynamics not in criterion.unknowns.slices
+    slow = [] if known else border.with_slow_poles(criterion, here.x)
     held = []
     for x in () if known else (here.x, *slow):
         end = yield from _with_poles(problem, x, problem.builders, figures)
@@ -362,8 +343,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS, 
             return best.evidence(*here.judge(solution, share), {**figures, "programmes": count + more})
         expected = gain + weight * here.amount
         fall = here.merit(weight) - new.merit(weight) if new is not None else -np.inf
-        entering = new is not None and not entered and (
-            damping > NEAR or new.at.value <= TRUSTED * here.at.after(step))
+        entering = new is not None and not entered and (damping > NEAR or new.at.value <= TRUSTED * here.at.after(step))
         if new is not None and (entering or fall >= 1e-3 * expected or abs(fall) <= 1e-12 * here.merit(weight)):
             if not damping and entered and fall > expected:
                 new = _longer(here, new, step, weight)

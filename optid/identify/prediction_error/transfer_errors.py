@@ -188,8 +188,7 @@ class TransferOrders(NamedTuple):
     nd: int | None = 0  # None where D is A
 
 
-def transfer_errors(data: Data, orders: TransferOrders, basis: Any, gauge: str | None, offset: Any
-                    ) -> TransferErrors:
+def transfer_errors(data: Data, orders: TransferOrders, basis: Any, gauge: str | None, offset: Any) -> TransferErrors:
     """Check the arguments of a fit, and return its criterion on the record in its own units (`optid.program.units`).
 
     Unless D is A the initial states are unknown, and a record with missing inputs is cut into experiments. Arguments

@@ -11,9 +11,9 @@ from optid.arrays import Array
 from optid.core.problem import Problem
 from optid.errors import InfeasibleError
 from optid.identify.arguments import enough_rows
+from optid.identify.prediction_error.criterion import INSIDE, excess
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import CONFIRMED, refine
-from optid.identify.prediction_error.tangent_problem import INSIDE, excess
 from optid.identify.process.descent import LONG, ProcessBox, ProcessPoint, descend, search_cells, sharpen
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.order import choose_types

@@ -1,28 +1,95 @@
-"""The low-rank problem of the nuclear-norm subspace method: its data, its weight, its observability matrix."""
+"""A fit by the nuclear norm: the low-rank problem of a record, its weight, and the steps of the other methods."""
 
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import LARGEST, Array, one_of, short_repr
 from optid.core.problem import Problem
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.identify.subspace.observability import Observability, Windows
-from optid.identify.subspace.plan import Plan
+from optid.identify.subspace.plan import Plan, in_record_units, make_plan
+from optid.identify.subspace.procedure import SubspaceSteps
 from optid.identify.subspace.projection import realise
 from optid.identify.validation.predictions import MEASURED, SIMULATION, prediction_fit
-from optid.program.solution import Solution
+from optid.program.solution import Solution, Status
+from optid.program.units import energy_unit
+from optid.solving.solve import Evidence, Procedure
 from optid.structures.nuclear_norm import KnownSignals, NuclearProblem, window_starts
 
 Values = Mapping[str, Array]
 
 RANK, NOTHING = 1e-3, 1e-5  # singular values below this part of the largest, of that of measured outputs, are none
-LARGEST = 10  # order at most where it is chosen
+HIGHEST = 10  # order at most where it is chosen
 SAMPLES = 4000  # outputs at most: the cube of their number is what a decomposition costs
+# weights tried by default, each the inverse of a noise variance relative to the variance of the outputs
+WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))
+Pose = Callable[..., Problem]  # (the structured problem of a record, lambda) -> the problem
+
+
+def fit_low_rank(pose: Pose, steps: SubspaceSteps, data: Data, weight: float | str | Sequence[float],
+                 noise: float | None, hold_out: float, **settings: Any) -> Procedure:
+    """Choose a weight where there are several, solve the problem, and go on as the other subspace methods.
+
+    Arguments and errors as of `formulations.nuclear_subspace.nuclear`; the settings are those of `make_plan`.
+    """
+    if not 0 < hold_out < 1:
+        raise StructureError(f"hold_out={hold_out!r}: it must be a fraction in (0, 1)")
+    plan = make_plan("subspace.nuclear", data, **settings)
+    return in_record_units(_fit(pose, steps, plan, _weights(weight, noise), noise, hold_out), plan)
+
+
+def _weights(weight: float | str | Sequence[float], noise: float | None) -> tuple[float, ...]:
+    if noise is not None:
+        if not 1 / LARGEST <= noise <= LARGEST or weight != "auto":
+            raise StructureError(f"noise={short_repr(noise)} is a positive standard deviation that takes the place of "
+                                 "weight=")
+        return (1.0,)
+    if isinstance(weight, str):
+        one_of("weight", weight, ("auto",))
+        return WEIGHTS
+    found = tuple(float(w) for w in np.atleast_1d(np.asarray(weight, dtype=float)))
+    if not found or not all(0 < w < np.inf for w in found):
+        raise StructureError(f"weight={weight!r}: give a positive number, several, or 'auto'")
+    return found
+
+
+def _fit(pose: Pose, steps: SubspaceSteps, plan: Plan, weights: tuple[float, ...], noise: float | None, hold_out: float
+         ) -> Procedure:
+    trials, weight = {}, weights[0]
+    if len(weights) > 1:
+        weight, nx, trials = yield from choose_weight(plan, weights, hold_out, partial(pose, weight=1.0))
+        plan = replace(plan, nx=nx)
+    structured = structure(plan)
+    if noise is not None:
+        weight = float(np.mean(structured.scale)) ** 2 / noise**2 * energy_unit(plan.units)
+    solution: Solution = yield pose(structured, structured.penalty(weight))
+    if not solution.has_point:
+        return Evidence.pointless(solution.status, solution.reason)
+    _, sizes = parts = structured.decompose(solution.values)
+    rank, nx = structured.rank(sizes), plan.order or structured.order(sizes)
+    if nx > rank:
+        return Evidence.pointless(Status.FAILED, f"order {nx}, but the low-rank matrix has rank {rank} at this weight: "
+                                                 "use a larger weight or a smaller order")
+    figures = {"order": nx, "block rows": structured.problem.rows, "form": plan.instruments, "singular values": sizes,
+               **trials, "weight": weight, "lambda": structured.penalty(weight), "rank": rank,
+               "objective of the convex programme": solution.objective,
+               "its dual bound": -np.inf if solution.bound is None else solution.bound.value,
+               "its relative gap": solution.gap,
+               "missing outputs estimated": int(np.sum(~structured.problem.known))}
+    found = replace(structured.observability(solution.values, parts, nx), figures=figures)
+    evidence = yield from steps.run(plan, found)
+    if evidence.model is None:
+        return evidence
+    evidence = replace(evidence, main="low rank", objective=solution.objective, bound=solution.bound or evidence.bound)
+    if solution.status in (Status.INACCURATE, Status.LIMIT) and evidence.status.is_optimum:
+        evidence = replace(evidence, status=solution.status, reason=f"nuclear-norm programme: {solution.reason}")
+    return evidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +107,8 @@ class Structured:
         return int(np.sum((sizes > RANK * sizes[0]) & (sizes > NOTHING * self.size)))
 
     def order(self, sizes: Array) -> int:
-        """Return the rank, one at least, `LARGEST` and what the block rows can carry at most."""
-        return int(np.clip(self.rank(sizes), 1, min(LARGEST, self.problem.rows - 1)))
+        """Return the rank, one at least, `HIGHEST` and what the block rows can carry at most."""
+        return int(np.clip(self.rank(sizes), 1, min(HIGHEST, self.problem.rows - 1)))
 
     def in_units(self, view: Mapping[str, Any], _: Values) -> dict[str, Any]:
         """Return the expression ``output``: yhat in units of the record, beside the unknowns themselves."""
@@ -110,7 +177,7 @@ def order_scores(structured: Structured, values: Values, rest: Data) -> dict[int
     """Return the simulation fit in %, on another record, of the models of a point, by order: as given, or all."""
     order, parts, found = structured.windows.plan.order, structured.decompose(values), {}
     most = min(structured.rank(parts[1]), structured.problem.rows - 1)
-    for nx in range(1, min(most, LARGEST) + 1) if order is None else [order] * (order <= most):
+    for nx in range(1, min(most, HIGHEST) + 1) if order is None else [order] * (order <= most):
         try:
             score = held_out_fit(structured.observability(values, parts, nx).model(), rest)
         except (RankError, DataError):  # an order this part of the record cannot carry is no candidate

@@ -105,7 +105,7 @@ class Windows:
             outputs = simulate_clipped(raw, found.windows.expansion, a, step.form.c,
                                        step.matrices(step.least_squares()))
             windows = replace(self, records=[np.hstack([record, y]) for record, y in zip(raw, outputs)],
-                              expansion=self.expansion.with_simulated())
+                              expansion=replace(self.expansion, simulated=True))
         return windows
 
     def best_weighting(self, projection: Projection, nx: int) -> Projection:

@@ -74,8 +74,7 @@ class Plan:
 
     def about(self, what: str) -> tuple[Any, ...]:
         """Constraints about "poles" or about "coefficients"."""
-        return tuple(rule for rule in self.constraints
-                     if what in getattr(rule, "about", frozenset({"coefficients"})))
+        return tuple(rule for rule in self.constraints if what in getattr(rule, "about", frozenset({"coefficients"})))
 
     def direct(self) -> tuple[bool, ...]:
         """Feedthrough of every input."""

@@ -1,4 +1,4 @@
-"""The steps that the subspace methods share, for the problems that a formulation states.
+"""The steps that the subspace methods share, for the problems that a formulation states, and their declaration.
 
 1. The observability matrix from projections, no problem: `optid.identify.subspace.observability`.
 2. (A, C) from its shift invariance, poles where the constraints want them: `optid.identify.subspace.shift`.
@@ -7,11 +7,12 @@
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+from optid.bases import has_products
 from optid.certificate.hankel import simulation_bound
 from optid.certificate.lifting import certify_rank_one
 from optid.core.least_squares import RankOneForm
@@ -26,9 +27,12 @@ from optid.identify.subspace.shift import constrained_shift
 from optid.models.roots import spectral_radius
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
+from optid.solving.steps import steps
 
 # multipliers up to which the proof of the third step, which says nothing of (A, C), is worth a semidefinite programme
 RELAXED = 150
+MATRICES = {"shift": "SDP", "shift with fixed P": "SDP", "centre": "SDP"}
+"""Those that bring poles to where the constraints want them, or an unstable A into the unit disc."""
 
 
 @dataclass(frozen=True)
@@ -100,3 +104,31 @@ def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block
     bound = simulation_bound(plan.records, form.expansion, form.n, form.weights, solution.objective / unit, block_rows,
                              said)
     return replace(bound, value=unit * bound.value)
+
+
+def subspace_steps(own: Mapping[str, str] | None = None, tangent: str = "") -> Callable[[Callable], Callable]:
+    """Declare "split", which chooses B, D and E, and the steps that move poles, behind those of a formulation.
+
+    Args:
+        own: its own steps.
+        tangent: the step whose programmes hold all constraints, in the tangent of a state-space model.
+    """
+    def declare(given: Mapping[str, Any]) -> dict[str, str]:
+        rules = given["constraints"]
+        inner = _about_coefficients(rules) if "split" in given else []  # starts obey rules about poles alone
+        products = has_products([given.get("basis", "linear"), given.get("feedback_basis")])
+        split = "NLP rank-one" if products and given.get("split", "exact") == "exact" else (
+            _convex(inner) if inner else "QP linear")
+        whole = {tangent: _convex(rules) if rules else "QP linear"} if tangent else {}
+        return {**(own or {}), **whole, "split": split, **MATRICES}
+    return steps(declare)
+
+
+def _about_coefficients(rules: Sequence[Any]) -> list[Any]:
+    """Return the constraints about coefficients; a function of the user is one."""
+    return [rule for rule in rules if "coefficients" in getattr(rule, "about", {"coefficients"})]
+
+
+def _convex(rules: Sequence[Any]) -> str:
+    """Return the class of a least-squares programme under constraints of a state-space model."""
+    return "SDP" if any(getattr(rule, "matrix", False) for rule in rules) else "QP"
