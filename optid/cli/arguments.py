@@ -43,8 +43,7 @@ def reading(how: Mapping[str, Any]) -> dict[str, Any]:
         **{key: split_names(how[key]) for key in ("inputs", "outputs", "columns", "input_units", "output_units",
                                                   "quality")},
         "missing": tuple(split_names(how["missing"]) or ()),
-        "time": False if how["time"] == "none" else how["time"],
-    }
+        "time": False if how["time"] == "none" else how["time"]}
 
 
 def record(files: Sequence[Path | str] | None, how: Mapping[str, Any], example: str | None, seed: int, *,
@@ -101,8 +100,7 @@ def options_of_model(how: Mapping[str, Any], model: Any) -> dict[str, Any]:
         **how,
         "inputs": how["inputs"] or list(model.inputs),
         "outputs": how["outputs"] or list(model.outputs),
-        "dt": model.dt if how["dt"] is None else how["dt"],
-    }
+        "dt": model.dt if how["dt"] is None else how["dt"]}
 
 
 def state_space_model(path: Path) -> Any:

@@ -97,8 +97,7 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
         found = dictionary(
             plant, kinds=words.split_names(kinds) or list(KINDS), process=words.directions(load, "--process", plant),
             state_jump=state_jump, disturbances=words.split_names(disturbance) or (),
-            zeros=words.pairs(words.split_names(zero), "--zero", ZERO, float),
-        )
+            zeros=words.pairs(words.split_names(zero), "--zero", ZERO, float))
         work.step("searching")
         uncertainty: Any = "ignore"
         if origin is not None:
@@ -106,18 +105,15 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
             uncertainty = model_uncertainty(found.model, origin, decoupled=found.predictor if silent else None)
         answer = judge(
             plant, record, found, false_alarm=false_alarm, max_faults=max_faults, method=method, coverage=coverage,
-            model_uncertainty=uncertainty, robust=robust, healthy=sound, rescale=rescale, seed=seed, solver=solver,
-        )
+            model_uncertainty=uncertainty, robust=robust, healthy=sound, rescale=rescale, seed=seed, solver=solver)
         work.write("diagnosis", out, answer.save)
         work.text = str(answer)
         if origin is None and answer.detected:
             work.heard.append(
                 "The model is assumed exact: a model error may appear as a fault. --identified FILE (the record "
-                "from which the model was identified) accounts for its uncertainty."
-            )
+                "from which the model was identified) accounts for its uncertainty.")
         if report is not None:
-            work.write("report", report, lambda path: answer.report(
-                path, record=record.name, command=command_line()))
+            work.write("report", report, lambda path: answer.report(path, record=record.name, command=command_line()))
         work.draw(answer.plot, picture)
 
 
@@ -175,8 +171,7 @@ def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: st
         built = rebuild(
             plant, found, record, constraints="default" if given is None else [] if given == ["none"] else given,
             stage=stage, nodes=nodes, low=words.numbers(low, "--low"), high=words.numbers(high, "--high"),
-            if_ambiguous=if_ambiguous, solver=solver, seed=seed,
-        )
+            if_ambiguous=if_ambiguous, solver=solver, seed=seed)
         work.write("model", saved, lambda path: save_model(built.model, path))
         work.text = str(built)
         if target is not None:

@@ -217,8 +217,7 @@ class Spinner:
             TimeElapsedColumn(),
             console=console,
             transient=True,
-            disable=not console.is_terminal,
-        )
+            disable=not console.is_terminal)
         self._task = self._progress.add_task("")
         self._timer = Timer(PATIENCE, self._progress.start)
         self._timer.daemon = True

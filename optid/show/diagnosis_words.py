@@ -70,8 +70,7 @@ def diagnosis_text(found: Diagnosis) -> str:
         *listed_findings(found.findings),
         f"{found.verdict}: {headline(found)}",
         f"{window_words(found)}, false alarm {found.false_alarm:g}, p-value {probability_words(found.p_value)}, "
-        f"method {found.method}",
-    ]
+        f"method {found.method}"]
     for answer in found.candidates:
         mark = "  <- best" * (answer is found.best)
         lines += ["", f"probability {answer.posterior:.3f}, gain {answer.gain:.1f}{mark}"]
@@ -123,8 +122,7 @@ def certificate_words(found: Diagnosis) -> str:
     if proof.basis == "infeasible healthy":
         return (
             f"proof: no healthy course lies within the bounds of the noise unless they are {proof.value:.3g} times as "
-            "wide; the parity vector is kept"
-        )
+            "wide; the parity vector is kept")
     return "no proof"
 
 
@@ -134,8 +132,7 @@ def remaining_words(found: Diagnosis) -> str:
     assert rest is not None
     words = (
         f"left unexplained: energy {rest.energy:.0f} of {rest.readings} readings; the worst of four tests "
-        f"({rest.test}) has p-value {probability_words(rest.p_value)}"
-    )
+        f"({rest.test}) has p-value {probability_words(rest.p_value)}")
     return words if found.verdict != "unknown" else f"{words}; {course_words(found)}"
 
 
@@ -166,8 +163,7 @@ def diagnosis_sentences(found: Diagnosis, *, notes: bool = True) -> list[str]:
         sentences = [
             f"The record of {found.window} samples agrees with the healthy {name}.",
             f"Healthy records depart as far from it with probability {probability_words(found.p_value)}; below "
-            f"{found.false_alarm:g} that would be an alarm.",
-        ]
+            f"{found.false_alarm:g} that would be an alarm."]
     elif found.verdict == "untestable" and found.detected:
         sentences = [f"{departs}the input does not excite the candidates: {silent}."]
     elif found.verdict == "untestable":
@@ -190,15 +186,12 @@ def diagnosis_sentences(found: Diagnosis, *, notes: bool = True) -> list[str]:
 def _faulty(found: Diagnosis) -> list[str]:
     best, *others = found.candidates
     phrase = " and ".join(
-        f"{fault.label} with {onset_words(fault)} and {_list(size_words(fault))}" for fault in best.faults
-    )
+        f"{fault.label} with {onset_words(fault)} and {_list(size_words(fault))}" for fault in best.faults)
     most = "most probably " * bool(others)
     first = f"The record is not healthy (p-value {probability_words(found.p_value)}): {most}{phrase}."
     if others:
         shares = _list([f"{answer.label} ({answer.posterior:.2f})" for answer in others])
-        second = (
-            f"At {100 * found.coverage:g} % it (probability {best.posterior:.2f}) is not isolable from {shares}."
-        )
+        second = (f"At {100 * found.coverage:g} % it (probability {best.posterior:.2f}) is not isolable from {shares}.")
     else:
         sure = f"No other candidate remains at {100 * found.coverage:g} %"
         second = f"{sure} (probability {best.posterior:.3f})."

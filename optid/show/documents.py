@@ -80,8 +80,7 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
             page_only=True),
         Section("solver", "Solver and times", lambda: [summary.solver_facts(fit)], page_only=True),
         Section("reproduce", "Reproduce", lambda: reproduce(
-            "\n".join(part for part in (command, summary.call(fit)) if part), str(fit)), page_only=True),
-    ]
+            "\n".join(part for part in (command, summary.call(fit)) if part), str(fit)), page_only=True)]
     judgeable = isinstance(fit.data, Data)
     left_out = {"trust": not judgeable and judged is None, "constraints": not fit.prices,
                 "validation": not judgeable and test is None}
@@ -136,8 +135,7 @@ def record_document(data: Data, *, command: str = "") -> Document:
         Section("channels", "Channels", lambda: [summary.channel_table(data)]),
         Section("tests", "What the record tells", lambda: [informativity_table(informativity(data))]),
         Section("figures", "Figures", draw, page_only=True),
-        *([Section("reproduce", "Reproduce", [Code(command)], page_only=True)] if command else []),
-    ])
+        *([Section("reproduce", "Reproduce", [Code(command)], page_only=True)] if command else [])])
 
 
 def _length(data: Any) -> str:

@@ -55,8 +55,7 @@ def isolability(found: Isolability) -> Figure:
     left, right = figure.subplots(1, 2)
     low, top = (float(finite.min()), float(finite.max())) if finite.size else (1.0, 10.0)
     shown = left.imshow(
-        np.where(np.isfinite(needed), needed, np.nan), cmap="YlOrBr", norm=LogNorm(low, max(top, 2 * low))
-    )
+        np.where(np.isfinite(needed), needed, np.nan), cmap="YlOrBr", norm=LogNorm(low, max(top, 2 * low)))
     for i in range(count):
         for j in range(count):
             word = f"{found.matrix[i, j]:.2g}" if np.isfinite(found.matrix[i, j]) else "never"

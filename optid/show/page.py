@@ -122,8 +122,7 @@ def template(name: str) -> Any:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        keep_trailing_newline=True,
-    ).get_template(name)
+        keep_trailing_newline=True).get_template(name)
 
 
 def versions() -> list[tuple[str, str]]:
@@ -132,8 +131,7 @@ def versions() -> list[tuple[str, str]]:
         ("optid", __version__),
         *((name, version(name)) for name in ("cvxpy", "numpy", "scipy")),
         ("Python", platform.python_version()),
-        ("Written", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
-    ]
+        ("Written", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC")]
 
 
 def figure(name: str, draw: Callable[[], "Figure"], caption: str) -> dict[str, Any]:

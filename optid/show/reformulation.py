@@ -75,8 +75,7 @@ def _sentences(found: Reformulation) -> list[str]:
     if found.schedule is not None:
         lines.append(
             f"The model was refitted from {found.schedule.samples} samples after the fault: {found.schedule.stage} "
-            f"({found.schedule.reason})."
-        )
+            f"({found.schedule.reason}).")
     if found.observer.lost:
         lines.append(f"{', '.join(found.observer.lost)}: not used; the filter on the other sensors estimates them.")
     return lines
@@ -100,12 +99,10 @@ def _tables(found: Reformulation) -> list[Table]:
     for one in () if found.schedule is None else found.schedule.values:
         rows = [
             (number(u, 4), number(old, 4), number(new, 4), number(std, 2), "prior only" if unseen else "")
-            for u, old, new, std, unseen in zip(one.nodes, one.healthy, one.values, one.std, one.prior_only)
-        ]
+            for u, old, new, std, unseen in zip(one.nodes, one.healthy, one.values, one.std, one.prior_only)]
         note = (
             f"Inputs after the fault from {one.seen[0]:.4g} to {one.seen[1]:.4g}; smallest eigenvalue of the "
-            f"information on the values with samples {one.excitation:.3g}. Standard errors: without constraints."
-        )
+            f"information on the values with samples {one.excitation:.3g}. Standard errors: without constraints.")
         tables.append(Table(f"Effect of {one.name}", ("input", "before", "now", "standard error", ""), rows, note))
     seen = found.observer
     if not seen.lost:
@@ -114,8 +111,7 @@ def _tables(found: Reformulation) -> list[Table]:
              number(seen.open_loop[name], 3)) for name, value in seen.rmse.items()]
     tables.append(Table(
         "Outputs", ("output", "sensor", "predicted RMSE", "noise of the sensor", "RMSE of a simulation"), rows,
-        "Of the outputs without their noise, from the Riccati equation of the filter on the used sensors.",
-    ))
+        "Of the outputs without their noise, from the Riccati equation of the filter on the used sensors."))
     return tables
 
 

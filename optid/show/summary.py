@@ -134,8 +134,7 @@ def record_facts(fit: "Fit") -> Facts:
     count = data.n_samples
     facts = [
         ("Record", data.name or "unnamed"),
-        ("Samples", (f"{count} every {data.interval}" if count else f"every {data.interval}")),
-    ]
+        ("Samples", (f"{count} every {data.interval}" if count else f"every {data.interval}"))]
     if isinstance(data, Data):
         facts.append(("Experiments", str(data.n_experiments)))
         if data.dated:
@@ -194,8 +193,7 @@ def channel_table(data: Data) -> Table:
     rows = [
         (c.name, c.role, c.unit or "-", *(number(value, 4) for value in (c.low, c.high, c.mean, c.std)),
          str(c.levels) if c.levels <= 1000 else "many", f"{c.missing:.2%}")
-        for c in data.raw().channels
-    ]
+        for c in data.raw().channels]
     return Table("Channels", ("channel", "role", "unit", "lowest", "highest", "mean", "std", "levels", "missing"), rows)
 
 
@@ -242,8 +240,7 @@ def model_facts(fit: "Fit") -> Facts:
     model = fit.model
     facts = [
         ("Orders", ", ".join(f"{name} {' '.join(map(str, np.atleast_1d(n)))}" for name, n in model.orders.items())),
-        ("Poles", in_words(model.poles) or "none"),
-    ]
+        ("Poles", in_words(model.poles) or "none")]
     if isinstance(noise := getattr(model, "noise", None), str) and noise:
         facts.append(("Noise", noise))
     if model.levels is not None:
@@ -267,8 +264,7 @@ def _gauge(model: Any) -> str:
         "norm": "norm of b is one",
         "gain": "static gain of the linear part is one",
         "b0": "first coefficient of b is one",
-        "none": "",
-    }
+        "none": ""}
     words = known.get(model.gauge, str(model.gauge))
     if model.gauge != "norm":
         return words
@@ -304,8 +300,7 @@ def noise_table(fit: "Fit") -> Table | None:
         rows.append((label, number(innovation, 4), number(total, 4), word, p_value))
     note = (
         "Standard deviations. Q, R and S (model.noise) are those of the innovation form; others with the same spectrum "
-        "explain the record equally well."
-    )
+        "explain the record equally well.")
     return Table("Noise", ("output", "innovations", "noise at output", "colour", "p value"), rows, note)
 
 

@@ -32,8 +32,7 @@ def run(*words: object):
 def table(path: Path, **columns: np.ndarray) -> Path:
     rows = zip(*columns.values())
     path.write_text(
-        "\n".join([",".join(columns), *(",".join("" if v != v else repr(float(v)) for v in row) for row in rows)])
-    )
+        "\n".join([",".join(columns), *(",".join("" if v != v else repr(float(v)) for v in row) for row in rows)]))
     return path
 
 
@@ -116,15 +115,13 @@ def test_the_command_line_and_python_give_the_same_model(csv, tmp_path):
     result = run(
         "fit", csv, "--dt", 0.5, "--na", 1, "--nb", 1, 2, "--nk", 0, 1, "--basis", "polynomial:3", "polynomial:2",
         "--constraint", "monotone:increasing,channel=u1", "--gauge", "b0", "--ridge", 1e-3, "--model",
-        tmp_path / "m.json",
-    )
+        tmp_path / "m.json")
     assert result.exit_code == 0, result.output
     from formulations.constraints import shape
 
     fit = optid.fit(
         optid.read(csv, dt=0.5), na=1, nb=[1, 2], nk=[0, 1], basis=["polynomial:3", "polynomial:2"],
-        constraints=[shape.monotone("increasing", channel="u1")], gauge="b0", ridge=1e-3,
-    )
+        constraints=[shape.monotone("increasing", channel="u1")], gauge="b0", ridge=1e-3)
     loaded = optid.load(tmp_path / "m.json")
     assert np.array_equal(loaded.a, fit.model.a) and loaded.dt == 0.5
     assert all(np.array_equal(one, other) for one, other in zip(loaded.b, fit.model.b))
@@ -148,8 +145,7 @@ def test_a_test_file_is_validated_on(csv):
 
 def test_other_arguments_of_the_formulation_pass_through_set(csv):
     result = run(
-        "fit", csv, "--inputs", "u1", "--formulation", "hammerstein_arx.nuclear", *ORDERS, "--set", "weight=0.25"
-    )
+        "fit", csv, "--inputs", "u1", "--formulation", "hammerstein_arx.nuclear", *ORDERS, "--set", "weight=0.25")
     assert result.exit_code == 0, result.output
     assert "nuclear dual" in result.output
     wrong = run("fit", csv, "--inputs", "u1", *ORDERS, "--set", "wait=3")
@@ -184,8 +180,7 @@ def test_a_suggestion_is_overruled_and_cut_to_what_the_formulation_takes():
 
 def test_a_solver_is_chosen_by_one_word():
     result = run(
-        "fit", "--example", "dead_zone", "--formulation", "hammerstein_arx.overparametrised", "--solver", "scs"
-    )
+        "fit", "--example", "dead_zone", "--formulation", "hammerstein_arx.overparametrised", "--solver", "scs")
     assert result.exit_code == 0 and "scs" in result.output
 
 
@@ -346,8 +341,7 @@ def bad(folder: Path, kind: str) -> list[object]:
     u, y = rng.uniform(-1, 1, 100), rng.standard_normal(100)
     spoiled = {
         "infinite": (np.where(np.arange(100) == 7, np.inf, u), y), "constant": (np.ones(100), y),
-        "binary": (np.sign(u), y), "levels": (np.round(u), y), "short": (u[:6], y[:6]),
-    }
+        "binary": (np.sign(u), y), "levels": (np.round(u), y), "short": (u[:6], y[:6])}
     if kind in spoiled:
         return ["fit", table(folder / "bad.csv", u=spoiled[kind][0], y=spoiled[kind][1]), *ORDERS]
     good = table(folder / "good.csv", u=u, y=y)
@@ -371,8 +365,7 @@ def bad(folder: Path, kind: str) -> list[object]:
         "no folder": ["fit", good, *ORDERS, "--report", folder / "nowhere" / "r.html"],
         "contradiction": ["fit", good, *ORDERS, "--constraint", "coefficients:a,low=0.5", "stable:0.3"],
         "not installed": ["fit", good, *ORDERS, "--solver", "mosek"],
-        "pair": ["fit", good, *ORDERS, "--set", "weight"],
-    }[kind]
+        "pair": ["fit", good, *ORDERS, "--set", "weight"]}[kind]
 
 
 @pytest.mark.parametrize(
@@ -423,8 +416,7 @@ def test_debug_shows_where_it_happened(tmp_path):
 
 def program(*words: object) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, "-m", "optid", *map(str, words)], capture_output=True, text=True, timeout=600
-    )
+        [sys.executable, "-m", "optid", *map(str, words)], capture_output=True, text=True, timeout=600)
 
 
 def test_the_module_runs_and_says_its_version():
@@ -446,8 +438,7 @@ def test_cvxpy_is_imported_without_the_packages_it_hardly_needs():
     code = (
         "import sys, optid; optid.fit; print('cvxpy' in sys.modules, 'scipy.stats' in sys.modules);"
         "from cvxpy.atoms.quantum_rel_entr import entropy; import scipy.stats;"
-        "print(entropy([0.5, 0.5]) == scipy.stats.entropy([0.5, 0.5]))"
-    )
+        "print(entropy([0.5, 0.5]) == scipy.stats.entropy([0.5, 0.5]))")
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.split() == ["True", "False", "True"]
 
@@ -463,16 +454,14 @@ def test_a_fit_without_a_report_needs_no_figures(csv, tmp_path):
     code = (
         "import sys; from typer.testing import CliRunner; from optid.cli.app import app;"
         f"r = CliRunner().invoke(app, ['fit', {str(csv)!r}, '--na', '1', '--nb', '1', '--basis', 'polynomial:3']);"
-        "assert r.exit_code == 0, r.output; print([m for m in ('matplotlib', 'pandas') if m in sys.modules])"
-    )
+        "assert r.exit_code == 0, r.output; print([m for m in ('matplotlib', 'pandas') if m in sys.modules])")
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip().splitlines()[-1] == "[]"
 
 
 def test_the_first_command_of_the_readme(tmp_path):
     result = program(
-        "fit", "--example", "thruster", "--report", tmp_path / "thruster.html", "--model", tmp_path / "m.json"
-    )
+        "fit", "--example", "thruster", "--report", tmp_path / "thruster.html", "--model", tmp_path / "m.json")
     assert result.returncode == 0, result.stderr
     assert "optimal (proved)" in result.stdout and result.stderr == ""
     assert (tmp_path / "thruster.html").read_text(encoding="utf-8").endswith("</html>\n")

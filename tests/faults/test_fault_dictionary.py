@@ -124,5 +124,4 @@ def test_choices_and_bad_input():
         (LookupFailed, "u7", lambda: dictionary(model, actuators=["u7"])),
         (LookupFailed, "z", lambda: dictionary(model, sensors="z")),
         (StructureError, "direction", lambda: dictionary(model, process={"load": [1.0]})),
-        (StructureError, "noise covariances", lambda: dictionary(replace(model, noise=None))),
-    )
+        (StructureError, "noise covariances", lambda: dictionary(replace(model, noise=None))))

@@ -230,5 +230,4 @@ def test_bad_input(found):
         (StructureError, "no noise covariances", replace(model, noise=None), data, {}),
         *((StructureError, "onsets", model, data, {"faults": found, "onsets": k}) for k in ("some", [], [N], [-1])),
         (DataError, "one at a time", model, several, {}),
-        (DataError, "'u2' is missing at sample 3", model, Data(broken, data.y), {}),
-    )))
+        (DataError, "'u2' is missing at sample 3", model, Data(broken, data.y), {}))))

@@ -145,5 +145,4 @@ def test_bad_input(found):
         (StructureError, "several magnitudes", s, "actuator:u1 stuck", {}),
         (StructureError, "noise has no course", s, "sensor:y1 noise", {}),
         (StructureError, "depends on the input", without, "actuator:u1 loss", {}),
-        (DataError, "untestable", still, "actuator:u2 loss", {}),
-    )))
+        (DataError, "untestable", still, "actuator:u2 loss", {}))))

@@ -100,8 +100,7 @@ def test_bad_input():
     refused(
         (StructureError, "noise covariances", lambda: whiten(replace(model, noise=None), Data(u, np.zeros((60, 2))))),
         (DataError, "too few", lambda: health(whiten(model, Data(u[:15], inject(model, u[:15]))))),
-        (DataError, "determine", lambda: model_uncertainty(model, Data(u[:10], inject(model, u[:10])))),
-    )
+        (DataError, "determine", lambda: model_uncertainty(model, Data(u[:10], inject(model, u[:10])))))
 
 
 # -- the uncertainty of an identified model ----------------------------------------------------------------------------

@@ -165,8 +165,7 @@ def test_bad_input(found):
         (StructureError, "No candidate has a signature",
          lambda: isolability(dictionary(small(), kinds="loss", state_jump=False), 40)),
         (LookupFailed, "sensor:y2",
-         lambda: isolability(found, 20, calibration=5000, draws=50).forecast("sensor:y", 1.0)),
-    )
+         lambda: isolability(found, 20, calibration=5000, draws=50).forecast("sensor:y", 1.0)))
 
 
 # -- faults whose signature depends on the input -----------------------------------------------------------------------

@@ -77,8 +77,7 @@ def diagnosis(model, *answers, verdict="faulty"):
     best = answers[0] if answers else None
     return Diagnosis(
         verdict, bool(answers), best, answers, 1e-3, proof, {}, COUNT, 0.01, 0.95, "exact", "", model.title,
-        model.outputs,
-    )
+        model.outputs)
 
 
 def answer(*estimates, posterior=1.0):
@@ -180,8 +179,7 @@ def test_refit_equals_regularised_least_squares_where_no_rule_binds(healthy):
     second = np.diff(np.eye(7), n=2, axis=0) / (0.2 * half)
     rows = np.vstack([
         np.column_stack([s, np.zeros(len(s))]), np.column_stack([curve.to_nodes / (0.5 * half), np.zeros(7)]),
-        np.column_stack([second @ curve.to_nodes, second @ curve.healthy]),
-    ])
+        np.column_stack([second @ curve.to_nodes, second @ curve.healthy])])
     wanted = np.concatenate([s @ problem.start - r, curve.healthy / (0.5 * half), second @ curve.healthy])
     expected = np.linalg.lstsq(rows, wanted, rcond=None)[0]
     assert 0 < expected[-1] < 1
@@ -352,8 +350,7 @@ def test_what_does_not_fit_is_refused_by_name(healthy, faults):
         *((StructureError, words, lambda how=how: allocate(healthy, **how)) for how, words in (
             ({"low": 1.0, "high": 0.0}, "empty"), ({"weights": [1.0, -1.0]}, "positive"),
             ({"route": "magic"}, "route"), ({"norm": np.eye(3), "limit": 1.0}, "norm of shape"))),
-        *((StructureError, "reference", lambda r=r: allocate(healthy).attainable(r)) for r in ([1.0], [1.0, np.nan])),
-    )
+        *((StructureError, "reference", lambda r=r: allocate(healthy).attainable(r)) for r in ([1.0], [1.0, np.nan])))
 
 
 def test_the_filter_is_as_good_as_it_predicts(healthy):

@@ -47,8 +47,7 @@ def pages(tmp_path_factory):
             folder / "comparison.html"),
         "order": optid.order(record).report(folder / "order.html"),
         "dated": report.write(dated_fit(), folder / "dated.html"),
-        "search": optid.identify(record, effort=3, workers=1).report(folder / "search.html"),
-    }
+        "search": optid.identify(record, effort=3, workers=1).report(folder / "search.html")}
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,7 @@ from optid.show.svg import inline
 def pages() -> dict[str, str]:
     return {
         "thruster": report.render(example_fit("thruster")), "mimo": report.render(mimo_fit(), two_by_two(seed=5)),
-        "linear": report.render(linear_fit()), "feedback": report.render(feedback_fit()),
-    }
+        "linear": report.render(linear_fit()), "feedback": report.render(feedback_fit())}
 
 
 @pytest.mark.parametrize("name", ["thruster", "mimo", "linear", "feedback"])
@@ -62,8 +61,7 @@ def test_the_verdict_the_figures_and_the_prices_are_on_the_page(pages):
     sections = {value for tag, name, value in page.attributes if tag == "section" and name == "id"}
     assert sections == {
         "trust", "dynamics", "optimum", "model", "figures", "constraints", "certificate", "validation", "data",
-        "solver", "reproduce",
-    }
+        "solver", "reproduce"}
     charts = json.loads(re.search(r'id="charts-data">(.*?)</script>', pages["thruster"], re.DOTALL)[1])
     assert pages["thruster"].count("<figure>") == len(charts) == 10
     assert "Bode diagram: phase" in text and "PASS (p = " in text
@@ -74,8 +72,7 @@ def test_the_verdict_the_figures_and_the_prices_are_on_the_page(pages):
 def test_names_are_text_never_markup():
     data = two_by_two()
     hostile = optid.Data(
-        data.u, data.y, 0.5, ['<script>alert("1")</script>', "a&b"], ["<b>y</b>", "'\"z"], name="<i>name</i>"
-    )
+        data.u, data.y, 0.5, ['<script>alert("1")</script>', "a&b"], ["<b>y</b>", "'\"z"], name="<i>name</i>")
     source = report.render(optid.fit(hostile, na=1, nb=1, basis="polynomial:2"))
     assert "<script>alert" not in source and "<b>y" not in source and "<i>name" not in source
     text = Page(source).text
@@ -103,8 +100,7 @@ def test_write_returns_the_path(tmp_path):
 def test_a_fit_without_a_model_is_refused():
     fit = optid.fit(
         example_fit("dead_zone").data, na=2, nb=2, basis="triangular:8", raises=False,
-        constraints=[lambda v: {"low": v["a"][0] <= -1, "high": v["a"][0] >= 1}],
-    )
+        constraints=[lambda v: {"low": v["a"][0] <= -1, "high": v["a"][0] >= 1}])
     with pytest.raises(optid.errors.DataError, match="infeasible"):
         report.render(fit)
 

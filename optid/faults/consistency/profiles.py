@@ -17,11 +17,7 @@ from optid.faults.signatures import Candidate
 if TYPE_CHECKING:
     from optid.faults.search.scanning import Scan
 
-PRIORS = {
-    "tv": "steps: constant between changes",
-    "trend": "ramps: straight between bends",
-    "smooth": "a random walk",
-}
+PRIORS = {"tv": "steps: constant between changes", "trend": "ramps: straight between bends", "smooth": "a random walk"}
 """Priors of the course."""
 
 EACH = 2

@@ -308,8 +308,7 @@ def _problem(model: "HammersteinSS", low: Any, high: Any, weights: Any) -> Alloc
         (Member.of(model),), np.array([one.v_low for one in inverses]),
         np.array([one.v_low if one.dead else one.v_high for one in inverses]),
         tuple(f"actuator:{model.inputs[c]}" for c in model.input_of), model.outputs, w, None, np.inf, inverses,
-        model.input_of, model.inputs, least, most, tuple(zip(model.feedback, model.output_of)),
-    )
+        model.input_of, model.inputs, least, most, tuple(zip(model.feedback, model.output_of)))
 
 
 def input_bounds(model: "HammersteinSS", low: Any, high: Any) -> tuple[Array, Array]:

@@ -50,8 +50,7 @@ class Probe:
         """Return the length, the separation and its bound."""
         return (
             f"probe of {len(self.u)} samples: {self.pair[0]} and {self.pair[1]} differ by {self.separation:.3g} "
-            f"standard deviations\n  (random levels {self.ordinary:.3g}; at most {self.bound:.3g} possible)"
-        )
+            f"standard deviations\n  (random levels {self.ordinary:.3g}; at most {self.bound:.3g} possible)")
 
 
 @dataclass(frozen=True, eq=False)

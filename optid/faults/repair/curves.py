@@ -57,8 +57,7 @@ class Curve:
         head = f"  {'u':>9}{'before':>12}{'now':>12}{'+-':>10}"
         rows = [
             f"  {u:>9.3g}{old:>12.4g}{new:>12.4g}{std:>10.2g}{'  prior only' if unseen else ''}"
-            for u, old, new, std, unseen in zip(self.nodes, self.healthy, self.values, self.std, self.prior_only)
-        ]
+            for u, old, new, std, unseen in zip(self.nodes, self.healthy, self.values, self.std, self.prior_only)]
         return "\n".join([f"f of {self.name}", head, *rows])
 
 

@@ -72,8 +72,7 @@ class Damage:
                 functions[i] = replace(one, mu=self.gains[i] * one.mu, offset=offset)
         return replace(
             model, nonlinearities=tuple(functions), offset_x=model.offset_x + model.B @ constants + self.added,
-            offset_y=model.offset_y + model.D @ constants, gauge="none",
-        )
+            offset_y=model.offset_y + model.D @ constants, gauge="none")
 
 
 def damages(model: "HammersteinSS", answer: "FaultAnswer") -> list[Damage]:

@@ -205,16 +205,14 @@ def _check(model: Any, diagnosis: Any, stage: str, nodes: int, if_ambiguous: str
     if getattr(model, "kind", "") != "HammersteinSS":
         raise StructureError(
             f"A {getattr(model, 'title', type(model).__name__)} cannot be reformulated: a state-space model with noise "
-            "covariances is needed (formulation hammerstein_ss.asivid)."
-        )
+            "covariances is needed (formulation hammerstein_ss.asivid).")
     if isinstance(diagnosis, tuple | list):
         raise StructureError("Several diagnoses: reformulate takes one, of one experiment.")
     if not hasattr(diagnosis, "verdict"):
         raise StructureError(f"{type(diagnosis).__name__} is no diagnosis: pass the result of optid.faults.diagnose.")
     if diagnosis.outputs and tuple(diagnosis.outputs) != model.outputs:
         raise DataError(
-            f"The diagnosis is of outputs {', '.join(diagnosis.outputs)}; the model has {', '.join(model.outputs)}."
-        )
+            f"The diagnosis is of outputs {', '.join(diagnosis.outputs)}; the model has {', '.join(model.outputs)}.")
     if diagnosis.verdict != "healthy" and not diagnosis.candidates:
         why = WITHOUT_ANSWER.get(diagnosis.verdict, "it has no candidates")
         raise StructureError(f"The diagnosis is {diagnosis.verdict!r}: {why}.")

@@ -135,8 +135,7 @@ def refit(model: "HammersteinSS", data: Data, damage: Damage, rules: RefitRules,
             at = ", ".join(f"{u:.3g}" for u in one.nodes[one.prior_only])
             warnings.warn(
                 f"{one.name}: no sample after the fault lies near {at} (inputs from {one.seen[0]:.3g} to "
-                f"{one.seen[1]:.3g}): the values there are prior only.", DataWarning, stacklevel=3,
-            )
+                f"{one.seen[1]:.3g}): the values there are prior only.", DataWarning, stacklevel=3)
     offsets = {c.label: problem.unpack(theta)[f"size[{c.label}]"] for c in problem.offsets}
     model = _plant(problem, theta)
     duals, objective = found.solution.duals, max(found.solution.objective, 1e-300)
