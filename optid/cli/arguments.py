@@ -198,3 +198,14 @@ def directions(words: Sequence[str] | None, option: str, model: Any = None) -> d
             raise StructureError(f"{option} {word}: {len(change)} numbers for {model.nx} states. Give one per state, "
                                  f"or its effect on the outputs: {name}={model.outputs[0]}:-1")
     return found
+
+
+def candidates(model: Any, kinds: Sequence[str], given: Sequence[str] | None, load: Sequence[str] | None,
+               disturbance: Sequence[str] | None, state_jump: bool, zero: Sequence[str] | None = None) -> Any:
+    """Return the dictionary of possible faults, of the kinds given or else of `kinds`; errors as of `dictionary`."""
+    from optid.faults import dictionary
+
+    return dictionary(
+        model, kinds=split_names(given) or list(kinds), process=directions(load, "--process", model),
+        state_jump=state_jump, disturbances=split_names(disturbance) or (),
+        zeros=pairs(split_names(zero), "--zero", "INPUT=VALUE, the input at which the actuator has no effect", float))

@@ -19,7 +19,7 @@ from optid.phrases import p_equals
 from optid.show import summary
 from optid.show.estimates import uncertainty
 from optid.show.sections import Axis, Chart, Series, decibels
-from optid.show.wording import frequency_title, time_title
+from optid.show.wording import frequency_title, time_title, with_unit
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -38,7 +38,7 @@ Lines = tuple[str, Sequence[Any] | None, dict[str, Any]]
 
 def channel_axis(name: str, unit: str) -> Axis:
     """Return the axis of a channel, with its unit where it has one."""
-    return Axis(f"{name} ({unit})" if unit else name, unit=unit)
+    return Axis(with_unit(name, unit), unit=unit)
 
 
 def time_axis(record: Data, k: int = 0) -> Axis:
@@ -250,7 +250,7 @@ def bode_charts(models: dict[str, Any], levels: Levels, known: Any = None, hertz
     caption = (f"From input to output{reach}" + ", with the mean slope of f" * bent
                + ("; shaded: 95 % bands." if known is not None else "."))
     unit = ratio_unit(first)
-    size_axis = Axis(f"magnitude (dB of {unit})" if unit else "magnitude (dB)", unit="dB")
+    size_axis = Axis(with_unit("magnitude", f"dB of {unit}" if unit else "dB"), unit="dB")
     return [Chart("Bode diagram: magnitude", caption, frequency, size_axis, magnitude, "bode"),
             Chart("Bode diagram: phase", caption, frequency, Axis("phase (degrees)", unit="degrees"), phase, "bode")]
 

@@ -9,7 +9,7 @@ from optid.bases.splines import Triangular
 from optid.identify.parameters import Parameter, Parameters, coefficient_parameters, function_parameters
 from optid.identify.parameters import uncertainty_or_reason as uncertainty
 from optid.models.functions import static_functions
-from optid.show.wording import Table, number
+from optid.show.wording import Table, number, with_unit
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -58,7 +58,6 @@ def nonlinearity_tables(fit: "Fit", inputs: bool) -> list[Table]:
         f = function.nonlinearity
         basis: Any = f.basis
         points = basis.grid(basis.p + 1 if isinstance(basis, Triangular) and basis.p < MOST_NODES else EVEN)
-        label = f"{function.name} ({function.unit})" if function.unit else function.name
         if known is None:
             rows, head = [(number(u, 4), number(value)) for u, value in zip(points, f(points))], ()
         else:
@@ -68,7 +67,7 @@ def nonlinearity_tables(fit: "Fit", inputs: bool) -> list[Table]:
             rows = [interval_row(number(u, 4), *row, size=size) for u, *row in numeric]
             head = ("std. error", "95 % low", "95 % high")
         title = f"{function.what} {function.word}, basis {_basis(f.basis)}"
-        found.append(Table(title, (label, function.word, *head), rows))
+        found.append(Table(title, (with_unit(function.name, function.unit), function.word, *head), rows))
     return found
 
 

@@ -12,7 +12,7 @@ from optid.faults.repair.reformulation import Reformulation
 from optid.show.diagnosis import diagnosis_charts
 from optid.show.diagnosis_words import headline
 from optid.show.isolability import isolation_chart
-from optid.show.panels import draw_chart, plain, shorten, with_style
+from optid.show.panels import draw_chart, draw_charts, plain, shorten, with_style
 from optid.show.reformulation import explanation_names, reformulation_charts
 from optid.show.sections import Chart
 
@@ -35,11 +35,7 @@ def _drawn(charts: Sequence[Chart], most: int, size: tuple[float, float], title:
     columns = min(len(charts), most)
     rows = -(-len(charts) // columns)
     figure = Figure(figsize=(size[0] * columns + 0.6, size[1] * rows + 0.5), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax, chart in zip(axes, charts):
-        draw_chart(ax, chart)
-    for ax in axes[len(charts) :]:
-        ax.remove()
+    draw_charts(figure, charts, most)
     figure.suptitle(plain(shorten(title, 90)), weight="bold")
     return figure
 

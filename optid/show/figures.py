@@ -55,13 +55,9 @@ def order_study(study: OrderStudy) -> Figure:
     """Draw singular values with thresholds, criteria and hold-out by number of states, and the scan of lags."""
     shown = charts.order_charts(study)
     figure = Figure(figsize=(8.6, 3.0 * -(-len(shown) // 2)), layout="constrained")
-    axes = figure.subplots(-(-len(shown) // 2), 2).ravel()
-    for ax, chart in zip(axes, shown):
-        panels.draw_chart(ax, chart)
+    axes = panels.draw_charts(figure, shown, 2)
     axes[2].set_yscale("symlog", linthresh=0.01)  # the first orders are far above, the others near the best
     axes[2].set_ylim(bottom=0)
-    for ax in axes[len(shown) :]:
-        ax.remove()
     scan = "" if study.lags is None else f"; {study.lags.best('bic')}"
     figure.suptitle(f"recommended: nx = {study.nx}{scan}")
     return figure

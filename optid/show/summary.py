@@ -1,6 +1,6 @@
 """Facts, tables and sentences about a fit, for the printed result and the HTML page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +15,10 @@ from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT
 from optid.models.functions import has_feedback, runs_free, static_functions
 from optid.models.kalman import NoiseCovariances
 from optid.models.roots import in_words
-from optid.phrases import seconds
+from optid.phrases import and_joined, seconds
 from optid.program.solution import Solution, Status
 from optid.show.sections import Facts
-from optid.show.wording import Table, gap_text, number, percent
+from optid.show.wording import Table, gap_text, number, percent, with_unit
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -36,7 +36,7 @@ PRICE_NOTE = (
 def title(fit: "Fit") -> str:
     """Name the kind of model, its outputs and its inputs."""
     model = fit.model
-    return f"{model.title} of {_and(model.outputs)} from {_and(model.inputs)}"
+    return f"{model.title} of {and_joined(model.outputs)} from {and_joined(model.inputs)}"
 
 
 def verdict(fit: "Fit") -> tuple[str, str, str]:
@@ -270,7 +270,7 @@ def _gauge(model: Any) -> str:
         return words
     functions = [function for function in static_functions(model) if function.family == "nonlinearities"]
     falls = [function.word for function, sign in zip(functions, model.gain_signs) if sign < 0]
-    return f"{words}; the output {'falls' if falls else 'rises'} with {_and(falls) if falls else 'f'}"
+    return f"{words}; the output {'falls' if falls else 'rises'} with {and_joined(falls) if falls else 'f'}"
 
 
 def has_noise(model: Any) -> bool:
@@ -295,9 +295,8 @@ def noise_table(fit: "Fit") -> Table | None:
     for name, unit, innovation, total in zip(model.outputs, model.output_units, own, spread):
         test = tests.get(name)
         word = "-" if test is None or np.isnan(test.p_value) else "white" if test.passed else "coloured"
-        label = f"{name} ({unit})" if unit else name
         p_value = "-" if test is None else number(test.p_value, 2)
-        rows.append((label, number(innovation, 4), number(total, 4), word, p_value))
+        rows.append((with_unit(name, unit), number(innovation, 4), number(total, 4), word, p_value))
     note = (
         "Standard deviations. Q, R and S (model.noise) are those of the innovation form; others with the same spectrum "
         "explain the record equally well.")
@@ -327,7 +326,3 @@ def _argument(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return repr(value.tolist())
     return repr(value)
-
-
-def _and(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -441,21 +441,21 @@ def test_allocation_falls_back_to_the_nlp_with_a_message(healthy):
 def test_targets_against_bounded_least_squares(healthy, seed):
     found = allocate(healthy, weights=[1.0, 2.0])
     r = np.random.default_rng(seed).normal(0, 4, 2)
-    member = found.problem.members[0]
+    member = found.members[0]
     base = member.rest_output(np.zeros(2))
     exact = lsq_linear(np.array([[1.0], [2.0]]) * member.gain(), np.array([1.0, 2.0]) * (r - base),
-                       (found.problem.low, found.problem.high))
+                       (found.v_low, found.v_high))
     target = found.attainable(r)
     assert target.distance == pytest.approx(np.sqrt(2 * exact.cost), abs=1e-5)
     assert target.reachable == (exact.cost < 1e-8)
     if not target.reachable:
         assert target.limiting and str(target).count("limited by actuator:")
         name, price = next(iter(target.limiting.items()))  # the price is what moving the bound is worth
-        i = found.problem.names.index(name)
-        at_top = target.v[i] > found.problem.middle[i]
-        low, high = np.array(found.problem.low), np.array(found.problem.high)
+        i = found.names.index(name)
+        at_top = target.v[i] > found.v_middle[i]
+        low, high = np.array(found.v_low), np.array(found.v_high)
         (high if at_top else low)[i] += 1e-4 if at_top else -1e-4
-        moved = replace(found, problem=replace(found.problem, low=low, high=high)).attainable(r)
+        moved = replace(found, v_low=low, v_high=high).attainable(r)
         assert (target.distance - moved.distance) / 1e-4 == pytest.approx(price, rel=0.05, abs=1e-3)
 
 
@@ -474,8 +474,8 @@ def test_corners_bound_what_can_be_held():
         assert len(corners) == 2 * m
         rng = np.random.default_rng(0)
         for _ in range(20):
-            v = rng.uniform(found.problem.low, found.problem.high)
-            y = found.problem.members[0].rest_output(v)
+            v = rng.uniform(found.v_low, found.v_high)
+            y = found.members[0].rest_output(v)
             edges = np.roll(corners, -1, axis=0) - corners
             sides = edges[:, 0] * (y - corners)[:, 1] - edges[:, 1] * (y - corners)[:, 0]
             assert np.all(sides >= -1e-9) or np.all(sides <= 1e-9)
@@ -541,13 +541,13 @@ def test_robust_control_is_the_best_for_the_worst_member(healthy, faults):
     target = robust.attainable(r)
 
     def worst(v):
-        return max(np.linalg.norm(m.rest_output(v) - r) for m in robust.problem.members)
+        return max(np.linalg.norm(m.rest_output(v) - r) for m in robust.members)
 
     assert target.distance == pytest.approx(worst(target.v), abs=1e-9)
     rng = np.random.default_rng(0)
-    grid = rng.uniform(robust.problem.low, robust.problem.high, (4000, 2))
+    grid = rng.uniform(robust.v_low, robust.v_high, (4000, 2))
     near = target.v + 0.05 * rng.standard_normal((500, 2))
-    near = np.clip(near, robust.problem.low, robust.problem.high)
+    near = np.clip(near, robust.v_low, robust.v_high)
     assert min(worst(v) for v in np.vstack([grid, near])) >= target.distance - 1e-4
     assert target.u.shape == (2,) and np.all(np.abs(target.u) <= 1.2)
 
