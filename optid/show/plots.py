@@ -98,20 +98,19 @@ def nonlinearity(fit: "Fit") -> Figure:
 
 
 @with_style
-def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | None = None) -> Figure:
+def residual_tests(fit: "Fit", data: Data | None = None) -> Figure:
     """Draw autocorrelations of the residuals and their cross-correlations with the inputs, with 99 % bands.
 
     Args:
         fit: the fit.
         data: the record; the estimation record when not given.
-        checked: the result of `optid.validate` on it, if available.
 
     Raises:
         DataError: the fit was made from a stream and no record is given.
     """
     record = _record(fit, data)
     figure = Figure(figsize=(9.0, 2.5 * record.l), layout="constrained")
-    _residual_panels(figure, checked or _validated(fit.model, record), record, outputs=record.l, inputs=record.m)
+    _residual_panels(figure, _validated(fit.model, record), record, outputs=record.l, inputs=record.m)
     return figure
 
 

@@ -5,13 +5,11 @@ import warnings
 import numpy as np
 import pytest
 from html_page import Page
-from matplotlib.figure import Figure
 from sample_fits import example_fit, feedback_fit, linear_fit, mimo_fit, two_by_two
 
 import optid
 from optid import report
 from optid.show.sections import extremes
-from optid.show.svg import inline
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +36,6 @@ def test_identifiers_are_unique_and_every_reference_has_its_target(pages, name):
     assert len(ids) == len(set(ids))
     targets = [value[1:] for value in page.values("href") if value.startswith("#")]
     assert set(targets) <= set(ids) and len(targets) > 7
-
-
-def test_references_in_a_figure_have_their_targets_under_the_names_of_the_figure():
-    figure = Figure()
-    figure.subplots().plot([0.0, 1.0], [0.0, 1.0], "o-")
-    drawn = inline(figure, "first", "a line")
-    names = set(re.findall(r'\bid="([^"]+)"', drawn))
-    references = re.findall(r'(?:href="#|url\(#)([^")]+)', drawn)
-    assert references and set(references) <= names and all(name.startswith("first-") for name in names)
 
 
 def test_the_verdict_the_figures_and_the_prices_are_on_the_page(pages):

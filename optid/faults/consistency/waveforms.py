@@ -100,7 +100,7 @@ class WaveformTest:
 
 
 def waveform_test(
-    found: Dictionary, whitened: Whitened, probability: float = 0.99, *, onset: int = 0, free_start: bool = True,
+    found: Dictionary, whitened: Whitened, probability: float = 0.99, *, onset: int = 0,
     data: Data | None = None,
 ) -> WaveformTest:
     """Test every place of a dictionary for a fault of any course.
@@ -112,7 +112,6 @@ def waveform_test(
         whitened: the window; one experiment.
         probability: with which the set is to contain the true place.
         onset: first sample that the fault can change; a later one makes the test more powerful.
-        free_start: whether the initial state of the window is unknown (as when it was fitted to the window).
         data: the record of the window, for the flat-line test of frozen sensors.
 
     Raises:
@@ -125,7 +124,7 @@ def waveform_test(
         raise StructureError(
             "Not isolable with one output: a fault of any course in any place explains it. Faults of a known course "
             "(bias, drift, loss) are isolable by the exact search.")
-    start = start_matrix(whitened) if free_start else np.zeros((whitened.r.size, 0))
+    start = start_matrix(whitened)
     tested, untested = [], {}
     for candidate in found.candidates:
         if candidate.fault_kind.without_course:
