@@ -523,6 +523,8 @@ def test_the_model_stays_healthy_while_several_answers_are_left(healthy, faults)
     assert "advice: wait" in str(found) and max(map(len, str(found).splitlines())) <= 80
     for action in ("robust", "probe", "wait"):
         assert reformulate(healthy, several, data, if_ambiguous=action).if_ambiguous.action == action
+    probed = reformulate(healthy, several, data, if_ambiguous="probe", low=-0.5, high=[0.4, 0.6]).if_ambiguous.probe
+    assert np.all((probed.u == -0.5) | (probed.u == [0.4, 0.6]))
 
 
 def test_kinds_of_one_part_are_one_explanation(healthy, faults):

@@ -162,20 +162,22 @@ def _responses(model: "HammersteinSS", members: Sequence[Damage], length: int) -
 
 
 def advise(
-    model: "HammersteinSS", members: Sequence[Damage], u: Array | None, robust: Allocation | None, why_not: str,
-    *, action: str = "auto", seed: int = 0,
+    model: "HammersteinSS", members: Sequence[Damage], u: Array | None, robust: Allocation | str, bounds: Any, *,
+    action: str = "auto", seed: int = 0,
 ) -> Ambiguity:
     """Return advice: "wait", "probe" or "robust", or the better one ("auto").
 
-    The wait follows from recent inputs u (N, m); `why_not` is the reason where there is no robust control.
+    The wait follows from recent inputs u (N, m); `robust` is the reason where there is no robust control, `bounds` are
+    the least and largest inputs.
 
     Raises:
         StructureError: an action that is not possible.
     """
-    wait = _waiting(model, members, u)
+    wait, (low, high) = _waiting(model, members, u), bounds
+    robust, why_not = (None, robust) if isinstance(robust, str) else (robust, "")
     probe, no_probe = None, ""
     try:
-        probe = probe_input(model, members, seed=seed)
+        probe = probe_input(model, members, low=low, high=high, seed=seed)
     except StructureError as error:
         no_probe = str(error)
     if action == "probe" and probe is None or action == "robust" and robust is None:

@@ -190,13 +190,13 @@ def reformulate(
     if len(distrusted) == model.l:
         distrusted = []
         notes = ["every sensor is suspected by some member: all are used until one member is left", *notes]
-    robust, why_not = None, ""
+    robust: Allocation | str
     try:
         robust = robust_allocation(model, broken, **bounds)
     except StructureError as error:
-        why_not = str(error)
+        robust = str(error)
     u = None if data is None else np.asarray(data.raw().experiments[0].u)
-    advice = advise(model, broken, u, robust, why_not, action=if_ambiguous, seed=seed)
+    advice = advise(model, broken, u, robust, (low, high), action=if_ambiguous, seed=seed)
     return Reformulation("ambiguous", model, model, observer(model, distrusted), allocation, None, tuple(members),
                          advice, tuple(notes))
 
