@@ -85,21 +85,15 @@ class CourseProblem:
         return self.matrix.shape[1]
 
     @cached_property
-    def _made(self) -> dict[tuple[str, str], Array]:
-        return {}
+    def shapes(self) -> dict[str, Array]:
+        """The courses (N, N) of a unit change at every sample, by the prior: steps, or ramps over the window."""
+        steps = np.tril(np.ones((self.count, self.count)))
+        return {"tv": steps, "trend": np.cumsum(steps, axis=0) / self.count}
 
-    def shapes(self, prior: str) -> Array:
-        """Return the courses (N, N) of a unit change at every sample: steps, or ramps over the window."""
-        if (prior, "shapes") not in self._made:
-            steps = np.tril(np.ones((self.count, self.count)))
-            self._made[prior, "shapes"] = steps if prior == "tv" else steps @ steps / self.count
-        return self._made[prior, "shapes"]
-
-    def design(self, prior: str) -> Array:
-        """Return the effects (N l, N) of these on the window."""
-        if (prior, "design") not in self._made:
-            self._made[prior, "design"] = self.matrix @ self.shapes(prior)
-        return self._made[prior, "design"]
+    @cached_property
+    def design(self) -> dict[str, Array]:
+        """The effects (N l, N) of these on the window."""
+        return {prior: self.matrix @ courses for prior, courses in self.shapes.items()}
 
     @property
     def differences(self) -> Array:
