@@ -192,8 +192,7 @@ def capture_warnings() -> Iterator[list[str]]:
         if issubclass(category, DataWarning) and str(message) not in heard:
             heard.append(str(message))
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         warnings.simplefilter("always", DataWarning)
         warnings.showwarning = keep
         try:

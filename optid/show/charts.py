@@ -67,8 +67,7 @@ def response_axis(model: Any) -> Axis:
 
 def validate_quietly(model: Any, record: Data) -> "Validation":
     """Validate a model without the warnings, which the notes repeat."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         return validate(model, record)
 
 
@@ -84,8 +83,7 @@ def free_run(model: Any, record: Data) -> list[Array] | None:
     """Simulated outputs, or None where an input is missing or the model runs away."""
     if not runs_free(model):
         return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         try:
             return simulate_outputs(model, record)
         except DataError:
@@ -121,8 +119,7 @@ def interval_band(fit: "Fit", record: Data) -> tuple[list[Lines], str, tuple[str
     """Return the 95 % interval of the simulation of a record as a band, if any, what it contains, and remarks."""
     if not runs_free(fit.model):
         return [], "", ()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         try:
             found: list[Any] = as_list(fit.simulate(record, interval=0.95))
         except OptidError as error:

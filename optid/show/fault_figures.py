@@ -9,10 +9,11 @@ from matplotlib.figure import Figure
 from optid.faults.diagnosis.answers import Diagnosis
 from optid.faults.isolability_study import Isolability
 from optid.faults.repair.reformulation import Reformulation
+from optid.phrases import short
 from optid.show.diagnosis import diagnosis_charts
 from optid.show.diagnosis_words import headline
 from optid.show.isolability import isolation_chart
-from optid.show.panels import draw_chart, draw_charts, plain, shorten, with_style
+from optid.show.panels import draw_chart, draw_charts, plain, with_style
 from optid.show.reformulation import explanation_names, reformulation_charts
 from optid.show.sections import Chart
 
@@ -36,7 +37,7 @@ def _drawn(charts: Sequence[Chart], most: int, size: tuple[float, float], title:
     rows = -(-len(charts) // columns)
     figure = Figure(figsize=(size[0] * columns + 0.6, size[1] * rows + 0.5), layout="constrained")
     draw_charts(figure, charts, most)
-    figure.suptitle(plain(shorten(title, 90)), weight="bold")
+    figure.suptitle(plain(short(title, 90)), weight="bold")
     return figure
 
 
@@ -45,7 +46,7 @@ def isolability(found: Isolability) -> Figure:
     """Draw the deflections that isolate each fault from each other, and the probabilities by deflection."""
     needed = found.matrix * found.unit[:, None]
     count = len(found.labels)
-    names = [shorten(label, 22) for label in found.labels]
+    names = [short(label, 22) for label in found.labels]
     finite = needed[np.isfinite(needed) & (needed > 0)]
     figure = Figure(figsize=(10.0, 0.35 * count + 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)

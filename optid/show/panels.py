@@ -106,11 +106,6 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def shorten(name: str, most: int = 18) -> str:
-    """Cut a long name, so that it fits above a small panel."""
-    return name if len(name) <= most else name[: most - 1] + "\N{HORIZONTAL ELLIPSIS}"
-
-
 def thin_line(t: Array, y: Array) -> tuple[Array, Array]:
     """Keep the extremes of every bin of a long line, so that no peak is lost; t, y (N,) become `POINTS` long."""
     if y.size <= POINTS:

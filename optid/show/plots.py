@@ -15,9 +15,10 @@ from optid.identify.dynamics import input_levels
 from optid.identify.validation import Validation
 from optid.lazy import public_names
 from optid.models.functions import static_functions
+from optid.phrases import short
 from optid.show import charts, frequency, panels, responses
 from optid.show.estimates import uncertainty
-from optid.show.panels import CLOSEUP, MUTED, attempt_panels, liveliest, plain, shorten, with_style
+from optid.show.panels import CLOSEUP, MUTED, attempt_panels, liveliest, plain, with_style
 from optid.show.sections import Chart
 
 if TYPE_CHECKING:
@@ -30,6 +31,9 @@ TEST = "test record"
 
 RUNGS = {"instant": "instant proof", "ascent": "dual ascent", "sdp": "SDP", "product cuts": "product cuts"}
 """The ladder of proofs of a rank-one programme, cheapest first."""
+
+NARROW = 18
+"""Characters of a name above a small panel."""
 
 THRESHOLD = 1e-8
 """Relative gap that counts as a proof."""
@@ -309,9 +313,9 @@ def _residual_panels(figure: Any, checked: Validation | str, record: Data, outpu
         tests += [checked.cross_correlations[name, channel] for channel in record.inputs[:inputs]]
         for k, test in enumerate(tests):
             ax = next(axes)
-            title = "Autocorrelation" if test.input is None else f"With past {shorten(test.input)}"
+            title = "Autocorrelation" if test.input is None else f"With past {short(test.input, NARROW)}"
             panels.draw_chart(ax, charts.correlation_chart(test), legend=False, title=title)
-            ax.set_ylabel("" if k else plain(f"residual of {shorten(name)}"))
+            ax.set_ylabel("" if k else plain(f"residual of {short(name, NARROW)}"))
 
 
 def _dynamics(fit: "Fit") -> list[Chart]:

@@ -58,8 +58,7 @@ def test_an_input_with_several_functions_has_one_share_lost_and_one_constant_for
 
 def test_the_trap_of_the_standard_plant(real_data):
     model, load = standard(real_data)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         found = dictionary(model, process={"load": load})
     assert found.labels == ("actuator:u1", "actuator:u2", "sensor:y1", "sensor:y2", "process:load", "state")
     (first, second, sine), = found.near

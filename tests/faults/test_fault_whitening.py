@@ -131,8 +131,7 @@ def test_model_errors_count_as_noise(real_data):
         wrong = drawn(identified, seed)
         data = Data(u, inject(model, u, seed=seed + 100))
         own = replace(identified, model=wrong)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
+        with warnings.catch_warnings(action="ignore", category=DataWarning):
             naive.append(np.sum(whiten_with(wrong, data, identified).r ** 2))
             aware.append(np.sum(whiten_with(wrong, data, identified, own).r ** 2))
     root = identified.predictor.root  # in units of the size that this short record shows

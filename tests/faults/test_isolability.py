@@ -123,8 +123,7 @@ def test_a_longer_window_helps_a_lasting_fault_and_not_a_transient_one(found):
 
 def test_faults_that_no_record_tells_apart_are_one_row():
     model = small(D=[[0.0, 0.0], [0.0, 0.3]])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         merged = dictionary(model, process={"same": model.B[:, 0]})
     study = isolability(merged, 40, calibration=5000, draws=300)
     assert study.ambiguity_groups == [("actuator:u1", "process:same")]

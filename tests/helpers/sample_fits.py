@@ -14,8 +14,7 @@ from optid.identify.fitting import Fit
 
 def quiet(*arguments: Any, **options: Any) -> Fit:
     """A fit whose remarks about the record are of no interest."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         return optid.fit(*arguments, **options)
 
 

@@ -116,15 +116,13 @@ def test_a_fit_without_a_point_is_described():
 
 def test_validation_text_has_the_fit_that_the_formula_gives():
     fit = linear_fit()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optid.errors.DataWarning)  # too short for the structure test
+    with warnings.catch_warnings(action="ignore", category=optid.errors.DataWarning):  # of its length
         text = str(optid.validate(fit.model, fit.data))
     assert re.search(r"y, one step +100\.00", text)
 
 
 def test_no_line_of_a_validation_is_wider_than_80_columns():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optid.errors.DataWarning)
+    with warnings.catch_warnings(action="ignore", category=optid.errors.DataWarning):
         text = str(optid.validate(mimo_fit().model, two_by_two(seed=5), horizon=4))
     assert max(map(len, text.splitlines())) <= 80
     for words in ("level_a, 4 steps", "level_a, experiment 3", 'temp "b": independent of level_a', "white"):

@@ -70,8 +70,7 @@ def test_names_are_text_never_markup():
 
 def test_the_test_record_is_validated(pages):
     page = Page(pages["mimo"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optid.errors.DataWarning)
+    with warnings.catch_warnings(action="ignore", category=optid.errors.DataWarning):
         validation = optid.validate(mimo_fit().model, two_by_two(seed=5))
     assert any("outside" in note for note in validation.notes)
     assert all(note in page.text for note in validation.notes)

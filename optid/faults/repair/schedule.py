@@ -149,8 +149,7 @@ def refit(model: "HammersteinSS", data: Data, damage: Damage, rules: RefitRules,
         ends, first = raw.select(experiments=raw.n_experiments - 1), raw.select(experiments=0)
         held = ends.window(ends.n_samples - samples, ends.n_samples)
         sound = first.window(0, damage.onset) if healthy is None and damage.onset >= FEWEST else healthy
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
+        with warnings.catch_warnings(action="ignore", category=DataWarning):
             repaired, unrepaired = errors(_plant(problem, trial.model.theta), held), errors(before, held)
             promised = Promise(
                 before.outputs, upper_rms(np.full((1, before.l), np.nan) if sound is None else errors(before, sound)),
