@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from commands import run
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 import optid
-from optid.cli.app import app
 from optid.cli.terminal import spread
 from optid.core.problem import Problem
 from optid.core.statement import for_solvers, statement_of
@@ -23,10 +22,6 @@ from optid.descriptions import describe
 from optid.examples import EXAMPLES, example
 from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, find_entry_points
 from optid.solving.solve import solve
-
-
-def run(*words: object):
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def table(path: Path, **columns: np.ndarray) -> Path:

@@ -5,10 +5,11 @@ import pickle
 import cvxpy as cp
 import numpy as np
 import pytest
+from commands import run
 from random_results import TANK, record, troubles
 from refusals import refuses
 from sample_fits import example_fit, quiet
-from test_cli import csv, run  # noqa: F401 - a fixture
+from test_cli import csv  # noqa: F401 - a fixture
 
 import optid
 from optid.backends import BackEnd
