@@ -60,11 +60,6 @@ def is_held(u: Array) -> bool:
     return bool(2 * np.count_nonzero(np.diff(known)) < known.size)
 
 
-def response_axis(model: Any) -> Axis:
-    """Return the axis of the time after a step."""
-    return Axis(time_title(model.time_unit, model.dt == 1))
-
-
 def validate_quietly(model: Any, record: Data) -> "Validation":
     """Validate a model without the warnings, which the notes repeat."""
     with warnings.catch_warnings(action="ignore", category=DataWarning):
@@ -264,11 +259,6 @@ def pole_chart(poles: dict[str, Array]) -> Chart:
             series.append(Series(f"{label} unstable".strip(), outside.real, outside.imag, "poles", "red"))
     return Chart("Poles", "A stable model has all its poles inside the unit circle.", Axis("real part"),
                  Axis("imaginary part"), series, equal=True)
-
-
-def correlation_charts(checked: "Validation") -> list[Chart]:
-    """Every residual test with its 99 % band, its name and its outcome."""
-    return [correlation_chart(test) for test in checked.tests]
 
 
 def correlation_chart(test: Correlation) -> Chart:

@@ -224,8 +224,8 @@ def _test_charts(fit: "Fit", record: Data) -> list[Any]:
 
 def validation_parts(checked: Validation) -> list[Any]:
     """Return errors, tests, notes and the correlations of a validation."""
-    notes = [Notes(checked.notes)] if checked.notes else []
-    return [*checks.validation_tables(checked), *notes, Charts(charts.correlation_charts(checked))]
+    notes, drawn = [Notes(checked.notes)] if checked.notes else [], map(charts.correlation_chart, checked.tests)
+    return [*checks.validation_tables(checked), *notes, Charts([*drawn])]
 
 
 def reproduce(call: str, text: str) -> list[Any]:

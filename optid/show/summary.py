@@ -228,7 +228,8 @@ def steps_table(fit: "Fit") -> Table | None:
 
 def call(fit: "Fit") -> str:
     """Write the Python call behind the fit; constraints by their names."""
-    words = [f"{key}={_argument(value)}" for key, value in fit.arguments.items() if key != "constraints"]
+    words = [f"{key}={value.tolist() if isinstance(value, np.ndarray) else value!r}"
+             for key, value in fit.arguments.items() if key != "constraints"]
     if fit.arguments.get("constraints"):
         names = [getattr(constraint, "name", None) or "a user function" for constraint in fit.arguments["constraints"]]
         words.append(f"constraints=[{', '.join(names)}]")
@@ -320,9 +321,3 @@ def _measured(value: Any) -> str:
         return number(float(array), 5)
     shown = " ".join(number(float(entry), 4) for entry in array.ravel()[:MOST])
     return shown + (f" ... ({array.size} in all)" if array.size > MOST else "")
-
-
-def _argument(value: Any) -> str:
-    if isinstance(value, np.ndarray):
-        return repr(value.tolist())
-    return repr(value)

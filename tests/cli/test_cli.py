@@ -191,10 +191,13 @@ def test_a_formulation_brings_its_options_along(csv, tmp_path):
     assert "Block rows: 6" in result.output
 
 
-def test_help_lists_the_options_of_the_formulation_named():
-    text = run("fit", "-f", "hammerstein_ss.asivid", "--help").output
-    for option in ("--nx", "--block-rows", "--feedback-basis", "--no-offset", "Arguments of hammerstein_ss.asivid"):
-        assert option in text
+@pytest.mark.parametrize(("words", "listed"), [
+    (["-f", "hammerstein_ss.asivid"],
+     ["--nx", "--block-rows", "--feedback-basis", "--no-offset", "Arguments of hammerstein_ss.asivid"]),
+    ([], ["--nx", "--feedback-basis", "--criterion", "--nc", "--equations", "Arguments of other formulations"])])
+def test_help_lists_the_options_of_the_formulation_named_or_of_all(words, listed):
+    text = run("fit", *words, "--help").output
+    assert all(option in text for option in listed) and text.count("--nx ") == 1
     assert "--nx" not in run("fit", "-f", "arx", "--help").output
 
 
@@ -465,13 +468,6 @@ def test_a_poor_model_is_told_with_what_would_help(tmp_path):
     result = run("fit", path, "--formulation", "arx", "--na", 1, "--nb", 1)
     assert "The model on this record: useless" in result.output and "FAIL" in result.output
     assert "Advice: a delay of 6 samples raises the simulation fit" in result.output and "--nk 6" in result.output
-
-
-def test_the_help_lists_the_options_of_every_formulation():
-    text = run("fit", "--help").output
-    for option in ("--nx", "--feedback-basis", "--criterion", "--nc", "--equations"):
-        assert option in text
-    assert text.count("--nx ") == 1 and "Arguments of other formulations" in text
 
 
 @pytest.mark.parametrize(("words", "message"), [

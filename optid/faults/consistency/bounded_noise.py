@@ -96,7 +96,6 @@ class ParityProof:
         return self.factor > 1.0
 
     def __str__(self) -> str:
-        """Return the parity sum, its limit and the factor."""
         total, most = abs(self.residual), self.limit
         return f"parity sum {total:.5g}, within the bounds at most {most:.5g}: factor {self.factor:.4f}"
 
@@ -144,7 +143,6 @@ class Membership:
         return None if self.proof is None else self.proof.weights
 
     def __str__(self) -> str:
-        """Print the factors and the proof."""
         verdict = "a healthy plant is impossible" if self.impossible else "a healthy plant is possible"
         lines = [f"bounds of the noise times {self.factor:.3f}: {verdict}"]
         lines += [f"  {self.proof}"[:80]] if self.proof is not None else [f"  no proof: {self.status}"[:80]]

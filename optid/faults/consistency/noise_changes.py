@@ -168,7 +168,6 @@ class NoiseTest:
         raise LookupFailed(f"{name!r} was not tested. {nearest(name, [c.label for c in self.changes])}")
 
     def __str__(self) -> str:
-        """Print the places."""
         lines = [f"more noise from sample {self.onset} on: p-value {p_value(self.p_value, 3)} "
                  f"({self.draws} simulated windows)",
                  f"  {'place':<36}{'std added':>11}{'scale':>8}{'nats':>9}"]

@@ -58,7 +58,6 @@ class Profile:
     status: str = ""
 
     def __str__(self) -> str:
-        """Print the changes and how the prior was chosen."""
         values = ", ".join(f"{prior} {value:.1f}" for prior, value in self.bic.items())
         lines = [f"course of {self.label[:60]}: {PRIORS[self.prior]}",
                  f"  BIC {values}; {self.freedom:.3g} degrees of freedom; largest gap {self.gap:.1e}"]

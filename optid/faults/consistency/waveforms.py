@@ -89,7 +89,6 @@ class WaveformTest:
         raise LookupFailed(f"{name!r} was not tested. {nearest(name, [place.name for place in self.places])}")
 
     def __str__(self) -> str:
-        """Print the places and which are consistent."""
         lines = [f"a fault of any course from sample {self.onset} on; set with probability {self.probability:g}",
                  f"  {'place':<34}{'energy left':>12}{'limit':>9}{'p-value':>10}"]
         for place in (*self.places, self.healthy):

@@ -48,7 +48,6 @@ class Target:
     idle: str = ""  # the reason where no actuator has an effect; "" otherwise
 
     def __str__(self) -> str:
-        """Return whether the reference is reached, the distance, and the limiting actuators."""
         wanted, got = (", ".join(f"{value:.4g}" for value in point) for point in (self.reference, self.y))
         if self.reachable:
             return f"({wanted}) is reached with inputs ({', '.join(f'{value:.4g}' for value in self.u)})"
@@ -256,7 +255,6 @@ class Allocation:
         return tuple(self.model.inputs[c] for c in sorted(live))
 
     def __str__(self) -> str:
-        """Return the actuators, their ranges, and the route."""
         rows = [f"actuators that move: {', '.join(self.moving) or 'none'}; route {self.route}"]
         for one, c in zip(self.inverses, self.model.input_of):
             state = "does not move" if one.dead else f"f from {one.v_low:.4g} to {one.v_high:.4g}"

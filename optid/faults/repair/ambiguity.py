@@ -47,7 +47,6 @@ class Probe:
     pair: tuple[str, str]  # the two members with the smallest distance
 
     def __str__(self) -> str:
-        """Return the length, the separation and its bound."""
         return (
             f"probe of {len(self.u)} samples: {self.pair[0]} and {self.pair[1]} differ by {self.separation:.3g} "
             f"standard deviations\n  (random levels {self.ordinary:.3g}; at most {self.bound:.3g} possible)")
@@ -66,7 +65,6 @@ class Ambiguity:
     probe: Probe | None = field(repr=False)  # an input that isolates them; None where no input does
 
     def __str__(self) -> str:
-        """Return the members, the action and its reason."""
         members = ", ".join(f"{label} ({100 * p:.0f} %)" for label, p in zip(self.labels, self.posteriors))
         lines = [f"{len(self.labels)} explanations are left: {members}", f"  advice: {self.action}; {self.reason}"]
         return "\n".join(lines + [f"  {line}" for line in str(self.probe or "").splitlines()])

@@ -53,7 +53,6 @@ class Curve:
         return self.visited < 0.5
 
     def __str__(self) -> str:
-        """Print the values as a table."""
         head = f"  {'u':>9}{'before':>12}{'now':>12}{'+-':>10}"
         rows = [
             f"  {u:>9.3g}{old:>12.4g}{new:>12.4g}{std:>10.2g}{'  prior only' if unseen else ''}"

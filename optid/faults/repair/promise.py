@@ -73,7 +73,6 @@ class Promise:
         return float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else float("nan")
 
     def __str__(self) -> str:
-        """State the bound for every output."""
         if np.isnan(self.bound).all():
             return "no error is promised: too few samples after the fault to try the repair on"
         told = ", ".join(f"{name} {value:.3g}" for name, value in zip(self.outputs, self.bound))

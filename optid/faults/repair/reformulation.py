@@ -54,7 +54,6 @@ class MemberModel:
         return self.damage.label
 
     def __str__(self) -> str:
-        """Return the refit, the observer, the allocation and the notes."""
         parts = [one for one in (self.schedule, self.observer, self.allocation) if one is not None]
         return "\n".join([*map(str, parts), *(f"note: {note}" for note in self.notes)])
 

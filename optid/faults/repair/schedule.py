@@ -54,7 +54,6 @@ class Schedule:
     reason: str = ""  # why this stage
 
     def __str__(self) -> str:
-        """Return the stage, the reason, the error promised and the values."""
         lines = [f"refit: {self.stage}, {self.samples} samples after the fault ({self.reason})"]
         if self.solution is not None:
             proof = f"gap {self.solution.gap:.1e}" if self.solution.proof else "no proof of global optimality"

@@ -82,7 +82,6 @@ class Observer:
         return one_or_all(found)
 
     def __str__(self) -> str:
-        """Return the lost sensors and the predicted error of each."""
         head = f"filter without {', '.join(self.lost)}" if self.lost else "filter on all sensors"
         rows = [f"  {name}: predicted RMSE {self.rmse[name]:.4g} (its own noise {self.noise[name]:.4g}, simulation "
                 f"{self.open_loop[name]:.4g})" for name in self.lost]
