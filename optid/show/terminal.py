@@ -57,8 +57,7 @@ def wrap_sentence(text: str, indent: str = "  ") -> list[str]:
 
 def wrap_lines(lines: Iterable[str]) -> str:
     """Break the lines that are too wide; they keep their indent."""
-    return "\n".join(part for line in lines
-                     for part in wrap_sentence(line, " " * (len(line) - len(line.lstrip()) + 2)))
+    return "\n".join(part for line in lines for part in wrap_sentence(line, " " * (len(line) - len(line.lstrip()) + 2)))
 
 
 def _equation(text: str) -> list[str]:
