@@ -10,7 +10,7 @@ healthy plant within the bounds has produced the window.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,10 +18,8 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults.whitening import Predictor
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 SIGMAS = 3.0
 """Default bounds of the noise, in standard deviations."""
@@ -154,7 +152,7 @@ class Membership:
         return "\n".join([*lines, *(f"  not tested: {label}, {why}"[:80] for label, why in self.untested.items())])
 
 
-def bounded_window(model: "HammersteinSS", data: Data, bounds: Any = SIGMAS) -> BoundedWindow:
+def bounded_window(model: HammersteinSS, data: Data, bounds: Any = SIGMAS) -> BoundedWindow:
     """Return a window with the bounds of its noise.
 
     Args:
@@ -219,7 +217,7 @@ def parity_proof(window: BoundedWindow, p: Array, unseen: Array) -> ParityProof:
     return ParityProof(p, q, residual, limit, rounding)
 
 
-def _bounds(model: "HammersteinSS", bounds: Any) -> tuple[Array, Array]:
+def _bounds(model: HammersteinSS, bounds: Any) -> tuple[Array, Array]:
     if isinstance(bounds, Mapping):
         if set(bounds) != {"process", "output"}:
             raise StructureError(f"bounds has {', '.join(map(repr, bounds))}; give 'process' and 'output'.")

@@ -3,19 +3,15 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.waveforms import waveform_matrix
-from optid.faults.search.scanning import ALIKE
+from optid.faults.search.scanning import ALIKE, Scan
 from optid.faults.search.subsets import exchange_search
 from optid.faults.signatures import Candidate
-
-if TYPE_CHECKING:
-    from optid.faults.search.scanning import Scan
 
 PRIORS = {"tv": "steps: constant between changes", "trend": "ramps: straight between bends", "smooth": "a random walk"}
 """Priors of the course."""
@@ -152,7 +148,7 @@ class CourseProblem:
         return np.unique([k for _, k in found]).astype(int)
 
 
-def course_problem(found: "Scan", label: str) -> CourseProblem:
+def course_problem(found: Scan, label: str) -> CourseProblem:
     """Return the regression of the course of one candidate with one magnitude, from the search of the window.
 
     Raises:

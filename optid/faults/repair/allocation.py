@@ -11,16 +11,16 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import DataWarning, StructureError
+from optid.faults.repair.damage import Damage
 from optid.faults.repair.inversion import Inverse, inverse
 from optid.faults.repair.member import Member
 from optid.faults.repair.virtual_sensor import check_stabilisable
+from optid.models import HammersteinSS
+from optid.models.nonlinearity import Nonlinearity
+from optid.program.solution import Solution
 
 if TYPE_CHECKING:
     from optid.core.problem import Problem
-    from optid.faults.repair.damage import Damage
-    from optid.models import HammersteinSS
-    from optid.models.nonlinearity import Nonlinearity
-    from optid.program.solution import Solution
 
 REACHED = 1e-4
 """A target is reached when its distance is below this share of the scale of the outputs."""
@@ -44,7 +44,7 @@ class Target:
     # the most limiting first; empty where the reference is reached
     limiting: dict[str, float]
     # of the programme behind it; None where no actuator has an effect
-    solution: "Solution | None" = field(default=None, repr=False)
+    solution: Solution | None = field(default=None, repr=False)
     idle: str = ""  # the reason where no actuator has an effect; "" otherwise
 
     def __str__(self) -> str:
@@ -80,7 +80,7 @@ class Allocation:
         solver: back end of the programmes; on the NLP route "auto" replaces one that takes no such programmes.
     """
 
-    model: "HammersteinSS"
+    model: HammersteinSS
     low: Array
     high: Array
     weights: Array
@@ -116,7 +116,7 @@ class Allocation:
         return tuple(f"actuator:{self.model.inputs[c]}" for c in self.model.input_of)
 
     @property
-    def feedback(self) -> "tuple[tuple[Nonlinearity, int], ...]":
+    def feedback(self) -> tuple[tuple[Nonlinearity, int], ...]:
         """Function and output of the columns of v beyond r."""
         return tuple(zip(self.model.feedback, self.model.output_of))
 
@@ -165,7 +165,7 @@ class Allocation:
             raise failure
         return min(found, key=lambda one: one.distance)
 
-    def _target(self, r: Array, u: Array, solution: "Solution | None", v: Array | None = None) -> Target:
+    def _target(self, r: Array, u: Array, solution: Solution | None, v: Array | None = None) -> Target:
         """The steady state of the plant, of several members the worst, at u and its v."""
         v = self.model.expand_inputs(u[None, :])[0] if v is None else v
         weights, points = self.weights, self._rests(u, v)
@@ -182,7 +182,7 @@ class Allocation:
             return [self.model.equilibrium(u)]
         return [(one.rest_state(v), one.rest_output(v)) for one in self.members]
 
-    def _limiting(self, solution: "Solution | None", distance: float) -> dict[str, float]:
+    def _limiting(self, solution: Solution | None, distance: float) -> dict[str, float]:
         """Actuators at a bound whose relaxation reduces the distance, with the multipliers of the distance."""
         if solution is None:
             return {f"actuator:{name}": float("nan") for name in self.model.inputs}
@@ -208,7 +208,7 @@ class Allocation:
                                  f"output ({', '.join(self.model.outputs)}).")
         return r
 
-    def _solved(self, posed: "Problem", start: Mapping[str, Array]) -> "Solution":
+    def _solved(self, posed: "Problem", start: Mapping[str, Array]) -> Solution:
         """Return the solution of a problem from a start; `StructureError` where there is no point."""
         from optid.backends.choice import find
         from optid.core.statement import for_solvers
@@ -263,7 +263,7 @@ class Allocation:
 
 
 def allocate(
-    model: "HammersteinSS", *, low: ArrayLike | None = None, high: ArrayLike | None = None,
+    model: HammersteinSS, *, low: ArrayLike | None = None, high: ArrayLike | None = None,
     weights: ArrayLike | None = None, norm: ArrayLike | None = None, limit: float = np.inf, route: str = "auto",
     solver: Any = "auto",
 ) -> Allocation:
@@ -311,7 +311,7 @@ def allocate(
     return replace(found, route=taken, messages=tuple(messages))
 
 
-def robust_allocation(model: "HammersteinSS", members: "Sequence[Damage]", *, low: Any, high: Any, weights: Any,
+def robust_allocation(model: HammersteinSS, members: Sequence[Damage], *, low: Any, high: Any, weights: Any,
                       solver: Any = "auto") -> Allocation:
     """Prepare the control of a plant with several explanations; arguments as of `allocate`.
 
@@ -328,7 +328,7 @@ def robust_allocation(model: "HammersteinSS", members: "Sequence[Damage]", *, lo
     return replace(found, members=tuple(Member.of(model, one.gains, one.constants, one.added) for one in members))
 
 
-def _within(model: "HammersteinSS", low: Any, high: Any, weights: Any, solver: Any) -> Allocation:
+def _within(model: HammersteinSS, low: Any, high: Any, weights: Any, solver: Any) -> Allocation:
     least, most = input_bounds(model, low, high)
     w = np.ones(model.l) if weights is None else np.broadcast_to(np.asarray(weights, dtype=float), (model.l,)).copy()
     if not np.all(np.isfinite(w) & (w > 0)):
@@ -338,7 +338,7 @@ def _within(model: "HammersteinSS", low: Any, high: Any, weights: Any, solver: A
                       np.array([one.v_low if one.dead else one.v_high for one in inverses]), solver=solver)
 
 
-def input_bounds(model: "HammersteinSS", low: Any, high: Any) -> tuple[Array, Array]:
+def input_bounds(model: HammersteinSS, low: Any, high: Any) -> tuple[Array, Array]:
     """Return the least and largest inputs (m,), those of the bases where none are given.
 
     Raises:

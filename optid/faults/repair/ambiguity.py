@@ -8,20 +8,18 @@ in the whitened innovations.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import StructureError
+from optid.faults.diagnosis.answers import FaultAnswer
 from optid.faults.repair.allocation import Allocation, input_bounds
 from optid.faults.repair.damage import Damage, damages
 from optid.faults.whitening import predictor
-
-if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import FaultAnswer
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 APART = 4.0
 """Distance of two explanations in the whitened innovations at which one is rejected nearly always."""
@@ -71,7 +69,7 @@ class Ambiguity:
 
 
 def probe_input(
-    model: Any, members: Sequence["Damage | FaultAnswer"], *, length: int = 20, hold: int = 5,
+    model: Any, members: Sequence[Damage | FaultAnswer], *, length: int = 20, hold: int = 5,
     low: ArrayLike | None = None,
     high: ArrayLike | None = None, seed: int = 0,
 ) -> Probe:
@@ -141,7 +139,7 @@ def probe_input(
     return Probe(course(best), reached, ordinary, bound, (broken[i].label, broken[j].label))
 
 
-def _responses(model: "HammersteinSS", members: Sequence[Damage], length: int) -> list[tuple[Array, Array]]:
+def _responses(model: HammersteinSS, members: Sequence[Damage], length: int) -> list[tuple[Array, Array]]:
     """Signature of each member in the whitened innovations: M v + d, M (length l, length r), d (length l,)."""
     steady, (n, r), l = predictor(model), model.B.shape, model.l  # noqa: E741
     x, y = np.zeros((length, n, r)), np.zeros((length, l, r))
@@ -160,7 +158,7 @@ def _responses(model: "HammersteinSS", members: Sequence[Damage], length: int) -
 
 
 def advise(
-    model: "HammersteinSS", members: Sequence[Damage], u: Array | None, robust: Allocation | str, bounds: Any, *,
+    model: HammersteinSS, members: Sequence[Damage], u: Array | None, robust: Allocation | str, bounds: Any, *,
     action: str = "auto", seed: int = 0,
 ) -> Ambiguity:
     """Return advice: "wait", "probe" or "robust", or the better one ("auto").
@@ -196,7 +194,7 @@ def advise(
                      robust, probe)
 
 
-def _waiting(model: "HammersteinSS", members: Sequence[Damage], u: Array | None) -> float:
+def _waiting(model: HammersteinSS, members: Sequence[Damage], u: Array | None) -> float:
     """Samples until the ordinary input isolates one of the closest pair."""
     plain = all(np.all(one.gains == 1) and not one.constants.any() and not one.added.any() for one in members)
     if plain and len({one.sensors for one in members}) > 1:

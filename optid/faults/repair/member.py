@@ -1,14 +1,12 @@
 """A plant whose inputs are re-allocated: linear dynamics in v = f(u), as under one explanation of its damage."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +21,7 @@ class Member:
     c: Array  # (l,)
 
     @classmethod
-    def of(cls, model: "HammersteinSS", gains: Any = 1.0, constants: Any = 0.0, added: Any = 0.0) -> "Member":
+    def of(cls, model: HammersteinSS, gains: Any = 1.0, constants: Any = 0.0, added: Any = 0.0) -> "Member":
         """Return the member of a model, with gains v + constants in place of v and a load added to its states."""
         constants = np.broadcast_to(constants, model.B.shape[1])
         A, B = model.A + model.L @ model.C, model.B + model.L @ model.D

@@ -12,16 +12,14 @@ counts.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array, as_list
 from optid.data.record import Data
 from optid.errors import DataError
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 CONFIDENCE = 0.9
 """Of the bounds of all outputs together, and of the spread of the estimates."""
@@ -79,7 +77,7 @@ class Promise:
         return f"rms error of {'one-step predictions' if self.ahead else 'the simulation'} at most: {told}"
 
 
-def errors(model: "HammersteinSS", data: Data) -> Array:
+def errors(model: HammersteinSS, data: Data) -> Array:
     """Return the errors (N, l) of a model on a record, its initial states fitted; NaN where a reading is missing.
 
     They are infinite where its run leaves all bounds.

@@ -8,7 +8,7 @@ the other parameters.
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,11 +21,9 @@ from optid.faults.repair.curves import Curve, curve_of
 from optid.faults.repair.damage import Damage
 from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor, predictor, whiten
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
 from optid.models.nonlinearity import Nonlinearity
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 NODES = 7
 """Values of a damaged nonlinearity that are estimated, where it has no nodes of its own."""
@@ -83,7 +81,7 @@ class RefitWindow(NamedTuple):
 class Refitting:
     """A record after a fault and the open parameters of the model."""
 
-    model: "HammersteinSS"  # the healthy model
+    model: HammersteinSS  # the healthy model
     steady: Predictor  # its predictor; its gain is kept
     windows: tuple[RefitWindow, ...]  # one per experiment
     curves: tuple[Curve, ...]  # the damaged nonlinearities
@@ -219,7 +217,7 @@ class Refitting:
         found[np.ix_(free, free)] = np.linalg.pinv(rows[:, free].T @ rows[:, free], hermitian=True)
         return found[: self.start.size, : self.start.size]
 
-    def model_at(self, theta: Array) -> "HammersteinSS":
+    def model_at(self, theta: Array) -> HammersteinSS:
         """Return the model of a vector of unknowns; constants of damaged nonlinearities become its offsets."""
         values = self.unpack(theta)
         changes: dict[str, Any] = {name: values[name] for name in MATRICES if self.whole}
@@ -278,7 +276,7 @@ class Refitting:
 
 
 def refitting(
-    model: "HammersteinSS", data: Data, damage: Damage, *, whole: bool = False, prior: RefitPrior | None = None,
+    model: HammersteinSS, data: Data, damage: Damage, *, whole: bool = False, prior: RefitPrior | None = None,
     nodes: int = NODES,
 ) -> Refitting:
     """Prepare a refit from the record after a fault.
@@ -316,7 +314,7 @@ def refitting(
     return found
 
 
-def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: int, known_start: bool) -> RefitWindow:
+def _cut(model: HammersteinSS, steady: Predictor, u: Array, y: Array, onset: int, known_start: bool) -> RefitWindow:
     """Cut a record at the onset of a fault; the state there is predicted from the samples before."""
     if onset >= len(y):
         raise DataError(f"The onset {onset} lies beyond the record of {len(y)} samples.")

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +14,9 @@ from optid.faults.repair.curves import Curve
 from optid.faults.repair.damage import Damage
 from optid.faults.repair.promise import CONFIDENCE, Promise, errors, rms, upper_rms
 from optid.faults.repair.refitting import NODES, RefitPrior, Refitting, refitting
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
-    from optid.program.solution import Solution
+from optid.program.solution import Solution
 
 HELD_OUT = 0.3
 """Share of the samples after the fault that is held out."""
@@ -50,7 +48,7 @@ class Schedule:
     offsets: dict[str, Array]  # {fault: estimated size}
     promise: Promise | None  # what is known of its errors; None without a refit
     active: tuple[str, ...]  # constraints that bind
-    solution: "Solution | None" = field(default=None, repr=False)  # of the last programme; None without one
+    solution: Solution | None = field(default=None, repr=False)  # of the last programme; None without one
     reason: str = ""  # why this stage
 
     def __str__(self) -> str:
@@ -81,8 +79,8 @@ class RefitRules:
     seed: int = 0
 
 
-def refit(model: "HammersteinSS", data: Data, damage: Damage, rules: RefitRules, healthy: Data | None = None
-          ) -> tuple["HammersteinSS", Schedule]:
+def refit(model: HammersteinSS, data: Data, damage: Damage, rules: RefitRules, healthy: Data | None = None
+          ) -> tuple[HammersteinSS, Schedule]:
     """Refit what a fault broke, or all parameters where that predicts held-out samples better.
 
     The model, the data and `healthy` are those of `reformulate`. A repair that is not offered leaves the model as it
@@ -161,7 +159,7 @@ def refit(model: "HammersteinSS", data: Data, damage: Damage, rules: RefitRules,
     return before if refused else model, schedule
 
 
-def _plant(problem: Refitting, theta: Array) -> "HammersteinSS":
+def _plant(problem: Refitting, theta: Array) -> HammersteinSS:
     """Return the model of a refit, with what the faults add at the end of the record."""
     model = problem.model_at(theta)
     for c in problem.offsets:
