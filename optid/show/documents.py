@@ -62,7 +62,12 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
         judged: the verdict on the model; that of the fit when not given.
         command: the command line behind the fit.
         advise: whether to say what would help a poor model, which takes time.
+
+    Raises:
+        DataError: the fit ended without a model.
     """
+    if fit.model is None:
+        raise DataError(f"there is no model to report: the fit ended with status '{fit.solution.status}'")
     lead = " · ".join(part for part in (fit.formulation, fit.data.name, _length(fit.data)) if part)
     curves = cache(lambda: responses.fit_responses(fit, estimates.uncertainty(fit)[0]))
     sections = [
@@ -321,12 +326,6 @@ def order_document(study: "OrderStudy") -> Document:
         Section("order", "Recommendation", [Banner("plain", f"nx = {study.nx}"), *notes,
                                             Charts(charts.order_charts(study)),
                                             Fold("Tables", [Code(order_text(study))])])])
-
-
-def require_model(fit: "Fit") -> None:
-    """Refuse a fit that ended without a model (`DataError`)."""
-    if fit.model is None:
-        raise DataError(f"there is no model to report: the fit ended with status '{fit.solution.status}'")
 
 
 def order_text(study: "OrderStudy") -> str:

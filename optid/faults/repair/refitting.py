@@ -16,7 +16,7 @@ from optid.arrays import Array
 from optid.bases import Linear
 from optid.data.record import Data
 from optid.data.stretches import interpolate_missing
-from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.errors import DataError, DataWarning, StructureError
 from optid.faults.repair.curves import Curve, curve_of
 from optid.faults.repair.damage import Damage
 from optid.faults.signatures import Candidate
@@ -135,6 +135,22 @@ class Refitting:
     def samples(self) -> int:
         """Samples after the fault."""
         return int(sum(len(w.u) - int(w.held) for w in self.windows))
+
+    @property
+    def least(self) -> int:
+        """Samples with every output that as many readings take as there are values to estimate."""
+        return -(-self._open // self.model.l)
+
+    @property
+    def shortage(self) -> str:
+        """Why the record is too short for a refit; "" where it is not."""
+        return "" if self.readings >= self._open else (
+            f"{self.readings} readings after the fault, and {self._open} values to estimate: at least {self.least} "
+            "samples with every output are needed.")
+
+    @property
+    def _open(self) -> int:
+        return sum(curve.values_open for curve in self.curves) + sum(c.into_state.shape[1] for c in self.offsets)
 
     def unpack(self, theta: Array) -> dict[str, Array]:
         """Return the unknowns by name."""
@@ -294,7 +310,6 @@ def refitting(
 
     Raises:
         DataError: a missing input after the fault, an onset beyond the record, other channels than the model's.
-        RankError: fewer readings than unknowns, with the least number of samples.
         StructureError: no noise covariances.
 
     Warns:
@@ -305,13 +320,7 @@ def refitting(
                     for number, part in enumerate(raw.experiments))
     inputs = np.vstack([w.u[int(w.held) :] for w in windows])
     curves = tuple(curve_of(model, i, inputs, raw, nodes, i in damage.dead) for i in damage.columns)
-    found = Refitting(model, steady, windows, curves, damage.offsets, whole, prior or RefitPrior())
-    needed = sum(curve.values_open for curve in curves) + sum(c.into_state.shape[1] for c in damage.offsets)
-    if found.readings < needed:
-        raise RankError(
-            f"{found.readings} readings after the fault, and {needed} values to estimate: at least "
-            f"{-(-needed // model.l)} samples with every output are needed.")
-    return found
+    return Refitting(model, steady, windows, curves, damage.offsets, whole, prior or RefitPrior())
 
 
 def _cut(model: HammersteinSS, steady: Predictor, u: Array, y: Array, onset: int, known_start: bool) -> RefitWindow:

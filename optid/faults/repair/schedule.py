@@ -9,7 +9,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.errors import DataWarning, RankError
+from optid.errors import DataWarning
 from optid.faults.repair.curves import Curve
 from optid.faults.repair.damage import Damage
 from optid.faults.repair.promise import CONFIDENCE, Promise, errors, rms, upper_rms
@@ -89,17 +89,11 @@ def refit(model: HammersteinSS, data: Data, damage: Damage, rules: RefitRules, h
     Warns:
         DataWarning: too few samples for a refit, with the least number; part of the input range that no sample visits.
     """
-    nodes, stage = rules.nodes, rules.stage
-    try:
-        narrow = refitting(model, data, damage, prior=rules.prior, nodes=nodes)
-    except RankError as error:
-        warnings.warn(f"{damage.label}: no refit. {error}", DataWarning, stacklevel=3)
-        counted = sum(1 if i in damage.dead else nodes for i in damage.columns) + sum(
-            c.into_state.shape[1] for c in damage.offsets)
-        after = max(0, data.experiments[0].y.shape[0] - damage.onset)
-        none = Schedule("prior", after, -(-counted // model.l), {}, (), {}, None, (), None,
-                        "too few for a refit: the model is that of the diagnosis")
-        return damage.nominal_model(model), none
+    narrow, stage = refitting(model, data, damage, prior=rules.prior, nodes=rules.nodes), rules.stage
+    if narrow.shortage:
+        warnings.warn(f"{damage.label}: no refit. {narrow.shortage}", DataWarning, stacklevel=3)
+        return damage.nominal_model(model), Schedule("prior", narrow.samples, narrow.least, {}, (), {}, None, (), None,
+                                                     "too few for a refit: the model is that of the diagnosis")
     if rules.prior is None and narrow.curves:  # of the curvatures the one that makes the record most probable
         tried = [replace(narrow, prior=replace(narrow.prior, curvature=curvature)) for curvature in BENDS]
         narrow = max(tried, key=Refitting.evidence)
@@ -138,7 +132,6 @@ def refit(model: HammersteinSS, data: Data, damage: Damage, rules: RefitRules, h
     duals, objective = found.solution.duals, max(found.solution.objective, 1e-300)
     active = tuple(name for name in found.problem.constraint_names
                    if np.max(np.abs(duals.get(name, 0.0)), initial=0.0) > 1e-6 * objective)
-    least = -(-sum(curve.values_open for curve in curves) // model.l)
     promised = None
     if narrow.samples >= FEWEST:
         trial = tried_on.get(stage) or _solved(problem.held_out(samples), rules)
@@ -154,8 +147,8 @@ def refit(model: HammersteinSS, data: Data, damage: Damage, rules: RefitRules, h
                 _spread(problem, theta, covariance, ends, rules.seed),
                 np.sqrt(np.diag(problem.steady.covariance)), not model.is_stable)
     refused = promised is not None and bool(promised.refusal)
-    schedule = Schedule("none" if refused else stage, problem.samples, least, scores, curves, offsets, promised, active,
-                        found.solution, reason)
+    schedule = Schedule("none" if refused else stage, problem.samples, problem.least, scores, curves, offsets, promised,
+                        active, found.solution, reason)
     return before if refused else model, schedule
 
 
