@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 MOST_EXPERIMENTS = 4
 COLOURS = tuple(f"c{k}" for k in range(10))
+CIRCLE = np.cos(np.linspace(0, 2 * np.pi, 181)), np.sin(np.linspace(0, 2 * np.pi, 181))
 INTERVAL = "95 % interval"
 FAMILIES = ("nonlinearities", "feedback", "latent")
 Lines = tuple[str, Sequence[Any] | None, dict[str, Any]]
@@ -249,8 +250,7 @@ def bode_charts(models: dict[str, Any], levels: Levels, known: Any = None, hertz
 
 def pole_chart(poles: dict[str, Array]) -> Chart:
     """Poles of models in the unit circle."""
-    angle = np.linspace(0, 2 * np.pi, 181)
-    series = [Series("", np.cos(angle), np.sin(angle), "line-only", "muted", width=1.2)]
+    series = [Series("", *CIRCLE, "line-only", "muted", width=1.2)]
     for k, (label, values) in enumerate(poles.items()):
         inside = np.abs(values) < 1
         series.append(Series(label or "poles", values[inside].real, values[inside].imag, "poles", COLOURS[k % 10]))
