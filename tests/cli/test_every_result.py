@@ -232,7 +232,7 @@ def test_a_panel_that_fails_leaves_the_others(monkeypatch, lenient):
     assert len([ax for ax in figure.get_axes() if ax.lines]) >= 3
 
 
-def test_a_noise_model_that_has_no_equivalent_in_raw_units_leaves_the_model(monkeypatch):
+def test_a_noise_model_that_has_no_equivalent_in_raw_units_leaves_the_model():
     fit = quiet(record("plain", 100, 1, 1, np.random.default_rng(1)), "hammerstein_ss.asivid", nx=1)
     evidence = fit.outcome.evidence
 

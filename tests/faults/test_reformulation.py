@@ -216,7 +216,7 @@ def test_refit_is_the_same_by_any_back_end(healthy, solver):
     assert found.objective == pytest.approx(other.objective, rel=1e-5)
 
 
-def test_rules_hold_and_binding_ones_are_named(healthy, faults):
+def test_rules_hold_and_binding_ones_are_named(healthy):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), seed=1, count=ONSET + 6)
     found = run(actuator(refitting(healthy, data, damaged(1))))
     mu = np.insert(found.model.model.nonlinearities[1].mu, 3, 0.0)
@@ -232,7 +232,7 @@ def test_rules_hold_and_binding_ones_are_named(healthy, faults):
 
 
 @pytest.mark.slow
-def test_refit_beats_the_healthy_model_and_the_wrong_part(healthy, faults):
+def test_refit_beats_the_healthy_model_and_the_wrong_part(healthy):
     fits = {"right": [], "wrong": [], "healthy": []}
     for seed in range(4):
         data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.6), seed=seed, count=ONSET + 30)
