@@ -167,14 +167,14 @@ class Allocation:
 
     def _target(self, r: Array, u: Array, solution: Solution | None, v: Array | None = None) -> Target:
         """The steady state of the plant, of several members the worst, at u and its v."""
-        v = self.model.expand_inputs(u[None, :])[0] if v is None else v
-        weights, points = self.weights, self._rests(u, v)
+        reached: Array = self.model.expand_inputs(u[None, :])[0] if v is None else v
+        weights, points = self.weights, self._rests(u, reached)
         distances = [float(np.linalg.norm(weights * (y - r))) for _, y in points]
         distance, (x, y) = max(distances), points[int(np.argmax(distances))]
         scale = self.scale if self.moving else np.sum((weights * (np.abs(r) + np.abs(y))) ** 2)
         reachable = distance <= REACHED * (np.sqrt(scale) or 1.0)
         limiting = {} if reachable else self._limiting(solution, distance)
-        return Target(r, y, u, v, x, distance, reachable, limiting, solution, self.idle)
+        return Target(r, y, u, reached, x, distance, reachable, limiting, solution, self.idle)
 
     def _rests(self, u: Array, v: Array) -> list[tuple[Array, Array]]:
         """Return the steady state and outputs of every member."""

@@ -158,19 +158,19 @@ def _responses(model: HammersteinSS, members: Sequence[Damage], length: int) -> 
 
 
 def advise(
-    model: HammersteinSS, members: Sequence[Damage], u: Array | None, robust: Allocation | str, bounds: Any, *,
+    model: HammersteinSS, members: Sequence[Damage], u: Array | None, control: Allocation | str, bounds: Any, *,
     action: str = "auto", seed: int = 0,
 ) -> Ambiguity:
     """Return advice: "wait", "probe" or "robust", or the better one ("auto").
 
-    The wait follows from recent inputs u (N, m); `robust` is the reason where there is no robust control, `bounds` are
-    the least and largest inputs.
+    The wait follows from recent inputs u (N, m); `control` is the robust one, or the reason why there is none; `bounds`
+    are the least and largest inputs.
 
     Raises:
         StructureError: an action that is not possible.
     """
     wait, (low, high) = _waiting(model, members, u), bounds
-    robust, why_not = (None, robust) if isinstance(robust, str) else (robust, "")
+    robust, why_not = (None, control) if isinstance(control, str) else (control, "")
     probe, no_probe = None, ""
     try:
         probe = probe_input(model, members, low=low, high=high, seed=seed)
