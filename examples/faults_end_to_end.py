@@ -33,7 +33,7 @@ def main(folder: Path) -> dict[str, float]:
 
     fresh = levels(1000, 3)
     truth = damaged.simulate(fresh)
-    r = allocate(damaged).problem.members[0].rest_output(np.array([0.8, 0.3]))
+    r = allocate(damaged).members[0].rest_output(np.array([0.8, 0.3]))
     courses = {"healthy model": held(damaged, model, r), "rebuilt model": held(damaged, rebuilt.model, r)}
     draw(folder / "faults_end_to_end.png", (w, y), events, rebuilt, courses, r)
     errors = {name: float(np.sqrt(np.mean((course[10:] - r) ** 2))) for name, course in courses.items()}

@@ -1,6 +1,7 @@
 """Counts and p values in words, the same in every message, table and page."""
 
 import math
+from collections.abc import Sequence
 
 SMALLEST = 1e-16
 """Smallest p value that is printed; the figures below are rounding errors of the tail."""
@@ -24,6 +25,11 @@ def p_equals(p: float, digits: int = 2) -> str:
 def seconds(value: float) -> str:
     """Write a time in the unit that suits it; a dash where there is none."""
     return "-" if math.isnan(value) else f"{1e3 * value:.3g} ms" if value < 0.9995 else f"{value:.3g} s"
+
+
+def and_joined(words: Sequence[str]) -> str:
+    """Write "a, b and c"."""
+    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
 
 
 def short(text: str, most: int = 120) -> str:

@@ -15,7 +15,8 @@ from scipy.signal import welch
 
 import optid
 from optid.plants import ReactionWheelPendulum
-from optid.show.panels import BLUE, GREEN, INK, MUTED, ORANGE, with_style, with_unit
+from optid.show.panels import BLUE, GREEN, INK, MUTED, ORANGE, plain, with_style
+from optid.show.wording import with_unit
 
 Cases = Sequence[tuple[str, optid.Data, dict[str, Any]]]
 
@@ -42,7 +43,7 @@ def draw_record(folder: Path, number: str, name: str, title: str, data: optid.Da
     figure, axes = panels(data.m + data.l, 1, (8.4, 1.8), sharex=True)
     for axis, (channel, unit, values), colour in zip(axes[:, 0], channels, [BLUE] * data.m + [INK] * data.l):
         axis.plot(data.time, values, color=colour, linewidth=1.0)
-        axis.set(ylabel=with_unit(channel, unit))
+        axis.set(ylabel=plain(with_unit(channel, unit)))
     axes[-1, 0].set(xlabel=time)
     save_numbered(figure, folder, number, name, title)
 
@@ -72,7 +73,7 @@ def draw_responses(folder: Path, number: str, name: str, title: str, cases: Case
             left.plot(t, simulated, dash, color=colour, label=method)
             right.plot(t, y - simulated, dash, color=colour)
             heads.append(f"{method} {feedback_error(model, data)[o]:.2g} %")
-        channel = with_unit(data.outputs[o], data.output_units[o])
+        channel = plain(with_unit(data.outputs[o], data.output_units[o]))
         left.set(title=f"{label}{data.outputs[o]}", ylabel=channel, xlabel=time)
         right.set(title="error: " + ", ".join(heads), ylabel=channel, xlabel=time)
     for axis, draw in zip(axes[len(rows):].ravel(), more):

@@ -12,7 +12,7 @@ Named variables: ``t``; named expressions: ``x`` (N, n) and, with a candidate, `
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -24,6 +24,7 @@ from optid.data.record import Data
 from optid.faults.consistency.bounded_noise import SIGMAS, BoundedWindow, bounded_window
 from optid.faults.consistency.candidate_tests import judge_candidates, prove_factor
 from optid.faults.signatures import Dictionary
+from optid.program.solution import Bound
 from optid.program.view import View
 from optid.solving.solve import Procedure
 
@@ -81,36 +82,18 @@ def _problem(window: BoundedWindow, signature: Any = None) -> Problem:
         held = {"no noise": noise(v, exact, np.ones(exact.size)) == 0} if exact.size else {}
         return {"noise": [relative <= v["t"], -relative <= v["t"]], **held}
 
+    def proof(problem: Problem, values: Mapping[str, Array], duals: Mapping[str, Array]) -> tuple[Bound, None]:
+        """Return the factor that the multipliers of the noise prove."""
+        weights, within = np.zeros(bounds.size), np.asarray(duals.get("noise", ()), dtype=float)
+        if within.size != 2 * bounded.size:
+            return Bound.none("the solver gave no multipliers"), None
+        upper, lower = np.split(within, 2)
+        weights[bounded] = (upper - lower) / bounds[bounded]
+        if exact.size and np.size(duals.get("no noise", ())) == exact.size:
+            weights[exact] = np.asarray(duals["no noise"], dtype=float)
+        return prove_factor(window, signature, weights, problem, values), None
+
     return Problem(
         "fault.membership", start, (Inner({"t": np.array(1.0)}),),
         further=lambda v, _: {"x": cp.reshape(v["states"], (count, n), order="C")}, restrictions=(possible,),
-        proof=NoiseRows(window, signature, bounds, bounded, exact).proof)
-
-
-class NoiseRows(NamedTuple):
-    """The rows of a programme: the noise of the states, then that of the readings.
-
-    Attributes:
-        window: the readings.
-        signature: the additions of a candidate to states and readings; None for a healthy plant.
-        bounds: of the noise, one per row.
-        bounded: numbers of the rows whose noise has a bound.
-        exact: numbers of the rows without noise.
-    """
-
-    window: BoundedWindow
-    signature: Any
-    bounds: Array
-    bounded: Array
-    exact: Array
-
-    def proof(self, problem: Problem, values: Mapping[str, Array], duals: Mapping[str, Array]) -> tuple[Any, None]:
-        """Return the factor that the multipliers of the noise prove."""
-        weights, within = np.zeros(self.bounds.size), np.asarray(duals.get("noise", ()), dtype=float)
-        if within.size != 2 * self.bounded.size:
-            return prove_factor(self.window, self.signature, np.zeros(0), problem, values), None
-        upper, lower = np.split(within, 2)
-        weights[self.bounded] = (upper - lower) / self.bounds[self.bounded]
-        if self.exact.size and np.size(duals.get("no noise", ())) == self.exact.size:
-            weights[self.exact] = np.asarray(duals["no noise"], dtype=float)
-        return prove_factor(self.window, self.signature, weights, problem, values), None
+        proof=proof)

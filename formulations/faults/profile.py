@@ -63,7 +63,7 @@ def profile(found: Scan, label: str, *, prior: str = "auto", sign: str | None = 
 def _changing(prior: str, shares: Sequence[float], rules: Sequence[Any], fits: CourseFits) -> Procedure:
     """Propose changes by the penalties, drop those that the criterion rejects, and fit again."""
     penalised = course_of_changes(fits.problem, prior).subject_to(*rules)
-    largest = float(np.abs(fits.problem.design(prior).T @ fits.problem.r).max())
+    largest = float(np.abs(fits.problem.design[prior].T @ fits.problem.r).max())
     for share in sorted(shares, reverse=True):
         solution = yield penalised.under_weights(**{"lambda": share * largest})
         changes = fits.keep_changes(prior, f"{prior} at {share:.2g}", solution)
@@ -92,7 +92,7 @@ def course_of_changes(problem: CourseProblem, prior: str) -> Problem:
         problem: from `optid.faults.consistency.profiles.course_problem`.
         prior: "tv" or "trend".
     """
-    count, shapes, columns = problem.count, problem.shapes(prior), problem.design(prior)
+    count, shapes, columns = problem.count, problem.shapes[prior], problem.design[prior]
     misfit = group_squares(problem.r, {"changes": columns[:, :, None]}, {"changes": np.ones(count)})  # 1/2 ‖r - T f‖²
 
     def state(**weights: float) -> Problem:
@@ -118,7 +118,7 @@ def _smoothed(shares: Sequence[float], rules: Sequence[Any], fits: CourseFits) -
 def random_walk(problem: CourseProblem, rho: float = 1.0) -> Problem:
     """State the problem of a random walk: that of the Kalman smoother, with constraints."""
     differences = problem.differences
-    shapes, misfit = problem.shapes("tv"), Squares.half(problem.r, {"f": problem.matrix})  # 1/2 ‖r - T f‖²
+    shapes, misfit = problem.shapes["tv"], Squares.half(problem.r, {"f": problem.matrix})  # 1/2 ‖r - T f‖²
     rough = Squares.half(np.zeros(problem.count), {"f": np.sqrt(rho) * differences})  # rho/2 ‖D1 f‖²
     return Problem(
         "fault.profile smooth", {"f": shapes @ _one(problem.matrix @ shapes, problem.r)}, (misfit, rough),

@@ -27,7 +27,7 @@ import numpy as np
 from optid.bases import Triangular
 from optid.core.problem import Problem
 from optid.core.terms import Inner, Squares, Values
-from optid.faults.repair.allocation_problem import AllocationProblem
+from optid.faults.repair.allocation import Allocation
 from optid.program.view import View
 
 Array = np.ndarray
@@ -42,7 +42,7 @@ SHARP = 1e-5
 """Width of a corner, as a share of the range."""
 
 
-def target(problem: AllocationProblem, *, reference: Any, constraints: Sequence[Any] = ()) -> Problem:
+def target(problem: Allocation, *, reference: Any, constraints: Sequence[Any] = ()) -> Problem:
     """State the problem of the resting point nearest to a reference, in v.
 
     Args:
@@ -50,26 +50,26 @@ def target(problem: AllocationProblem, *, reference: Any, constraints: Sequence[
         reference: (l,) of the outputs.
         constraints: builders of further constraints in v, x and y.
     """
-    start = _rests(problem, np.append(problem.middle, np.zeros(len(problem.feedback))))
+    start = _rests(problem, np.append(problem.v_middle, np.zeros(len(problem.feedback))))
     return _posed("allocation.target", problem, start, "v", reference).subject_to(*constraints)
 
 
-def resting(problem: AllocationProblem, *, reference: Any, constraints: Sequence[Any] = ()) -> Problem:
+def resting(problem: Allocation, *, reference: Any, constraints: Sequence[Any] = ()) -> Problem:
     """State the problem of the resting point nearest to a reference, in the inputs u; arguments as of `target`."""
-    u = (problem.u_low + problem.u_high) / 2
-    values = [float(one.f(u[c])) for one, c in zip(problem.inverses, problem.input_of)]
+    u = problem.middle
+    values = [float(one.f(u[c])) for one, c in zip(problem.inverses, problem.model.input_of)]
     start = {**_rests(problem, np.append(values, np.zeros(len(problem.feedback)))), "u": u}
     return _posed("allocation.resting", problem, start, "u", reference).subject_to(*constraints)
 
 
-def _posed(name: str, problem: AllocationProblem, start: Values, free: str, reference: Any) -> Problem:
+def _posed(name: str, problem: Allocation, start: Values, free: str, reference: Any) -> Problem:
     """State the problem: the cost, or the worst cost of several members, and the tie-break of what is free."""
     r, labels = np.asarray(reference, dtype=float), _labels(problem)
     costs = [Squares(np.diag(problem.weights), problem.weights * r, 0.0, (f"y{label}",)) for label in labels]
-    low, high, half, words = problem.low, problem.high, problem.half, problem.names
+    low, high, half, words = problem.v_low, problem.v_high, problem.v_half, problem.names
     if free == "u":
-        low, high = problem.u_low, problem.u_high
-        half, words = (high - low) / 2, tuple(f"actuator:{one}" for one in problem.inputs)
+        low, high = problem.low, problem.high
+        half, words = (high - low) / 2, tuple(f"actuator:{one}" for one in problem.model.inputs)
     tie = np.sqrt(TIE * problem.scale) / half
     chosen = np.eye(len(half), np.size(start[free]))  # feedback has columns of v, but no range
     effort = Squares(tie[:, None] * chosen, tie * (low + high) / 2, 0.0, (free,))
@@ -95,19 +95,19 @@ def _posed(name: str, problem: AllocationProblem, start: Values, free: str, refe
     if len(costs) > 1:
         start = {**start, "worst": np.array(max(cost.value(start) for cost in costs))}
         terms = (Inner({"worst": np.array(1.0)}), effort)
-    rest = problem.members[0].rest_output(np.append(problem.middle, np.zeros(len(problem.feedback))))
+    rest = problem.members[0].rest_output(np.append(problem.v_middle, np.zeros(len(problem.feedback))))
     return Problem(name, start, terms, model=lambda values: values["v"],
-                   facts={"channels": problem.names, "outputs": problem.outputs}, restrictions=(equations,),
+                   facts={"channels": problem.names, "outputs": problem.model.outputs}, restrictions=(equations,),
                    scale=float(np.sum((problem.weights * (r - rest)) ** 2)) or 1.0)
 
 
-def _labels(problem: AllocationProblem) -> list[str]:
+def _labels(problem: Allocation) -> list[str]:
     """Return the suffixes of the names of the unknowns of every member."""
     count = len(problem.members)
     return [f"[{number + 1}]" if count > 1 else "" for number in range(count)]
 
 
-def _rests(problem: AllocationProblem, v: Array) -> dict[str, Array]:
+def _rests(problem: Allocation, v: Array) -> dict[str, Array]:
     """Return v, and the states and outputs at which every member rests."""
     found = {"v": v}
     for label, member in zip(_labels(problem), problem.members):
@@ -115,16 +115,16 @@ def _rests(problem: AllocationProblem, v: Array) -> dict[str, Array]:
     return found
 
 
-def _functions(problem: AllocationProblem, view: View) -> dict[str, Any]:
+def _functions(problem: Allocation, view: View) -> dict[str, Any]:
     """Return v = [f(u); g(y)], by column."""
     u, v, y, found = view["u"], view["v"], view["y"], {}
-    for i, (one, c, name) in enumerate(zip(problem.inverses, problem.input_of, problem.names)):
+    for i, (one, c, name) in enumerate(zip(problem.inverses, problem.model.input_of, problem.names)):
         found[f"f {i + 1} of {name}"] = v[i] == _written(one.f, one.low, one.high, u[c])
     for j, (g, o) in enumerate(problem.feedback):
         low, high = g.basis.interval or (-1.0, 1.0)
         margin = 0.0 if g.basis.outside == "error" else (high - low) / 2
-        found[f"feedback of {problem.outputs[o]} {j + 1}"] = (
-            v[problem.low.size + j] == _written(g, low - margin, high + margin, y[o]))
+        found[f"feedback of {problem.model.outputs[o]} {j + 1}"] = (
+            v[problem.v_low.size + j] == _written(g, low - margin, high + margin, y[o]))
     return found
 
 

@@ -95,8 +95,7 @@ class Refitted:
         self.model = problem.model_at(self.theta)
 
 
-def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, constraints: Sequence[Any] | str
-          ) -> Problem:
+def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, constraints: Sequence[Any] | str) -> Problem:
     """State the problem linearised at theta: one sum of squares, of the record and of the prior."""
     believed, wanted = problem.prior_rows()
     rows = np.vstack([np.pad(s, ((0, 0), (0, len(problem.curves)))), believed])
@@ -139,8 +138,7 @@ def _not_stronger(curve: Any) -> list[Any]:
     rows = sign * np.diff(curve.to_nodes[:, :-1], axis=0)
     return [
         Rule(f"monotone[{curve.name}]", lambda view: rows @ view[f"mu[{curve.name}]"] >= 0),
-        Rule(f"not steeper[{curve.name}]", lambda view: rows @ view[f"mu[{curve.name}]"] <= sign * steps),
-    ]
+        Rule(f"not steeper[{curve.name}]", lambda view: rows @ view[f"mu[{curve.name}]"] <= sign * steps)]
 
 
 def _vector(problem: Refitting, values: Values) -> Array:

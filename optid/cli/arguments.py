@@ -43,8 +43,7 @@ def reading(how: Mapping[str, Any]) -> dict[str, Any]:
         **{key: split_names(how[key]) for key in ("inputs", "outputs", "columns", "input_units", "output_units",
                                                   "quality")},
         "missing": tuple(split_names(how["missing"]) or ()),
-        "time": False if how["time"] == "none" else how["time"],
-    }
+        "time": False if how["time"] == "none" else how["time"]}
 
 
 def record(files: Sequence[Path | str] | None, how: Mapping[str, Any], example: str | None, seed: int, *,
@@ -101,8 +100,7 @@ def options_of_model(how: Mapping[str, Any], model: Any) -> dict[str, Any]:
         **how,
         "inputs": how["inputs"] or list(model.inputs),
         "outputs": how["outputs"] or list(model.outputs),
-        "dt": model.dt if how["dt"] is None else how["dt"],
-    }
+        "dt": model.dt if how["dt"] is None else how["dt"]}
 
 
 def state_space_model(path: Path) -> Any:
@@ -200,3 +198,14 @@ def directions(words: Sequence[str] | None, option: str, model: Any = None) -> d
             raise StructureError(f"{option} {word}: {len(change)} numbers for {model.nx} states. Give one per state, "
                                  f"or its effect on the outputs: {name}={model.outputs[0]}:-1")
     return found
+
+
+def candidates(model: Any, kinds: Sequence[str], given: Sequence[str] | None, load: Sequence[str] | None,
+               disturbance: Sequence[str] | None, state_jump: bool, zero: Sequence[str] | None = None) -> Any:
+    """Return the dictionary of possible faults, of the kinds given or else of `kinds`; errors as of `dictionary`."""
+    from optid.faults import dictionary
+
+    return dictionary(
+        model, kinds=split_names(given) or list(kinds), process=directions(load, "--process", model),
+        state_jump=state_jump, disturbances=split_names(disturbance) or (),
+        zeros=pairs(split_names(zero), "--zero", "INPUT=VALUE, the input at which the actuator has no effect", float))

@@ -50,8 +50,7 @@ def design(like: Words = None, example: str | None = None, *, how: dict[str, Any
             record, kind, n=samples, levels=levels, band=None if band is None else (band[0], band[1]),
             amplitude=words.one_or_all(pairs), shaped=shaped, hold=hold, periods=periods, candidates=candidates,
             seed=seed, rows=rows, basis=words.one_or_all(words.split_names(basis)) or "polynomial:4",
-            feedback_basis=words.one_or_all(words.split_names(feedback_basis)),
-        )
+            feedback_basis=words.one_or_all(words.split_names(feedback_basis)))
         work.write("excitation", output, found.save)
         work.text = str(found)
 

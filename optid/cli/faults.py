@@ -4,9 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from optid.cli.options import File, Paths, Words
-from optid.cli.results import command_line, reading_for, save_model, working
-
-ZERO = "INPUT=VALUE, the input at which the actuator has no effect"
+from optid.cli.results import reading_for, save_model, working
 
 
 def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: float = 0.95, false_alarm: float = 0.01,
@@ -31,20 +29,16 @@ def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: fl
     if onset != "unknown" and not onset.isdecimal():
         raise StructureError(f"--onset {onset}: must be the number of a sample, or unknown")
     with working(report, picture) as work:
-        from optid.faults import dictionary
         from optid.faults import isolability as simulate
 
         plant = words.state_space_model(model)
         work.step("signatures")
-        found = dictionary(plant, kinds=words.split_names(kinds) or ["bias"],
-                           process=words.directions(load, "--process", plant), state_jump=state_jump,
-                           disturbances=words.split_names(disturbance) or ())
+        found = words.candidates(plant, ["bias"], kinds, load, disturbance, state_jump)
         work.step("simulating faults")
         study = simulate(found, window, onset=onset if onset == "unknown" else int(onset), prob=prob,
                          false_alarm=false_alarm, draws=draws, seed=seed)
         work.text = str(study)
-        if report is not None:
-            work.write("report", report, lambda path: study.report(path, command=command_line()))
+        work.page(study, report)
         work.draw(study.plot, picture)
 
 
@@ -82,23 +76,18 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
         from optid.cli import arguments as words
         from optid.errors import DataError
         from optid.faults import diagnose as judge
-        from optid.faults import dictionary, model_uncertainty
+        from optid.faults import model_uncertainty
         from optid.faults.diagnosis.diagnosing import KINDS
 
         plant = words.state_space_model(model)
         how = reading_for(plant, how)
         record: Any = words.record(data, how, example, seed)[0]
         if record.n_experiments > 1:
-            raise DataError(f"the record has {record.n_experiments} experiments: give one file with one experiment."
-                            "")
+            raise DataError(f"the record has {record.n_experiments} experiments: give one file with one experiment.")
         sound: Any = words.read_record(healthy, how) if healthy else None
         origin = _origin(identified, how)
         work.step("signatures")
-        found = dictionary(
-            plant, kinds=words.split_names(kinds) or list(KINDS), process=words.directions(load, "--process", plant),
-            state_jump=state_jump, disturbances=words.split_names(disturbance) or (),
-            zeros=words.pairs(words.split_names(zero), "--zero", ZERO, float),
-        )
+        found = words.candidates(plant, KINDS, kinds, load, disturbance, state_jump, zero)
         work.step("searching")
         uncertainty: Any = "ignore"
         if origin is not None:
@@ -106,18 +95,14 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
             uncertainty = model_uncertainty(found.model, origin, decoupled=found.predictor if silent else None)
         answer = judge(
             plant, record, found, false_alarm=false_alarm, max_faults=max_faults, method=method, coverage=coverage,
-            model_uncertainty=uncertainty, robust=robust, healthy=sound, rescale=rescale, seed=seed, solver=solver,
-        )
+            model_uncertainty=uncertainty, robust=robust, healthy=sound, rescale=rescale, seed=seed, solver=solver)
         work.write("diagnosis", out, answer.save)
         work.text = str(answer)
         if origin is None and answer.detected:
             work.heard.append(
                 "The model is assumed exact: a model error may appear as a fault. --identified FILE (the record "
-                "from which the model was identified) accounts for its uncertainty."
-            )
-        if report is not None:
-            work.write("report", report, lambda path: answer.report(
-                path, record=record.name, command=command_line()))
+                "from which the model was identified) accounts for its uncertainty.")
+        work.page(answer, report, record=record.name)
         work.draw(answer.plot, picture)
 
 
@@ -175,13 +160,10 @@ def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: st
         built = rebuild(
             plant, found, record, constraints="default" if given is None else [] if given == ["none"] else given,
             stage=stage, nodes=nodes, low=words.numbers(low, "--low"), high=words.numbers(high, "--high"),
-            if_ambiguous=if_ambiguous, solver=solver, seed=seed,
-        )
+            if_ambiguous=if_ambiguous, solver=solver, seed=seed)
         work.write("model", saved, lambda path: save_model(built.model, path))
         work.text = str(built)
         if target is not None:
             work.text += f"\ntarget {built.attainable(words.numbers(target, '--target') or [])}"
-        if report is not None:
-            work.write("report", report, lambda path: built.report(
-                path, record=record.name or (data[0].name if data else ""), command=command_line()))
+        work.page(built, report, record=record.name or (data[0].name if data else ""))
         work.draw(built.plot, picture)

@@ -75,8 +75,7 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
         work.step(f"fitting {formulation}")
         found = (fit_model if holdout is None else partial(fit_by_holdout, penalty=holdout))(
             record, formulation, solver=solver_choice(solver), accuracy=accuracy, time_limit=time_limit, prove=prove,
-            solver_options=words.pairs(option, "--option"), **arguments,
-        )
+            solver_options=words.pairs(option, "--option"), **arguments)
         _save(work, found, held_out, saved, None if stream or scheduler else data, how)
         work.step("standard errors")
         work.text = describe(found)

@@ -10,7 +10,6 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from optid.cli.faults import ZERO
 from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
 from optid.cli.terminal import Spinner, capture_warnings, note
@@ -75,7 +74,6 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     from optid.data.reading.format import Format
     from optid.data.reading.rows import RowReader
     from optid.errors import DataError
-    from optid.faults import dictionary
     from optid.faults.diagnosis.diagnosing import KINDS
 
     if (ack or rebase or maintenance) and (state is None or not state.is_file()):
@@ -105,11 +103,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
                 origin, sound = (words.read_record(files, how) if files else None for files in (identified, healthy))
                 if origin is None and sound is None and (thresholds is None or not thresholds.exists()):
                     origin = sound = _identified_from(model)
-                found = dictionary(
-                    plant, kinds=words.split_names(kinds) or list(KINDS), state_jump=state_jump,
-                    process=words.directions(load, "--process", plant),
-                    disturbances=words.split_names(disturbance) or (),
-                    zeros=words.pairs(words.split_names(zero), "--zero", ZERO, float))
+                found = words.candidates(plant, KINDS, kinds, load, disturbance, state_jump, zero)
                 watcher = _new(found, thresholds, arl0=arl0, window=window, seed=seed, healthy=sound,
                                uncertainty=origin, extrapolate=extrapolate, adapt=adapt,
                                drift=None if drift is None else drift * HOUR / plant.dt)

@@ -105,9 +105,9 @@ class Work(Spinner):
 
         self.write("picture", path, save)
 
-    def page(self, result: Any, path: Path | None, *more: Any) -> None:
+    def page(self, result: Any, path: Path | None, *more: Any, **options: Any) -> None:
         """Write the report of a result if a path is given; more arguments are those of its renderer."""
-        self.write("report", path, lambda path: render(result, "page", path, *more, command=command_line()))
+        self.write("report", path, lambda path: render(result, "page", path, *more, command=command_line(), **options))
 
     def print(self) -> None:
         """Print the result, the warnings that it does not contain, and the files written."""

@@ -192,8 +192,7 @@ def capture_warnings() -> Iterator[list[str]]:
         if issubclass(category, DataWarning) and str(message) not in heard:
             heard.append(str(message))
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         warnings.simplefilter("always", DataWarning)
         warnings.showwarning = keep
         try:
@@ -217,8 +216,7 @@ class Spinner:
             TimeElapsedColumn(),
             console=console,
             transient=True,
-            disable=not console.is_terminal,
-        )
+            disable=not console.is_terminal)
         self._task = self._progress.add_task("")
         self._timer = Timer(PATIENCE, self._progress.start)
         self._timer.daemon = True

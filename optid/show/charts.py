@@ -19,7 +19,7 @@ from optid.phrases import p_equals
 from optid.show import summary
 from optid.show.estimates import uncertainty
 from optid.show.sections import Axis, Chart, Series, decibels
-from optid.show.wording import frequency_title, time_title
+from optid.show.wording import frequency_title, time_title, with_unit
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 MOST_EXPERIMENTS = 4
 COLOURS = tuple(f"c{k}" for k in range(10))
+CIRCLE = np.cos(np.linspace(0, 2 * np.pi, 181)), np.sin(np.linspace(0, 2 * np.pi, 181))
 INTERVAL = "95 % interval"
 FAMILIES = ("nonlinearities", "feedback", "latent")
 Lines = tuple[str, Sequence[Any] | None, dict[str, Any]]
@@ -38,7 +39,7 @@ Lines = tuple[str, Sequence[Any] | None, dict[str, Any]]
 
 def channel_axis(name: str, unit: str) -> Axis:
     """Return the axis of a channel, with its unit where it has one."""
-    return Axis(f"{name} ({unit})" if unit else name, unit=unit)
+    return Axis(with_unit(name, unit), unit=unit)
 
 
 def time_axis(record: Data, k: int = 0) -> Axis:
@@ -60,15 +61,9 @@ def is_held(u: Array) -> bool:
     return bool(2 * np.count_nonzero(np.diff(known)) < known.size)
 
 
-def response_axis(model: Any) -> Axis:
-    """Return the axis of the time after a step."""
-    return Axis(time_title(model.time_unit, model.dt == 1))
-
-
 def validate_quietly(model: Any, record: Data) -> "Validation":
     """Validate a model without the warnings, which the notes repeat."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         return validate(model, record)
 
 
@@ -84,8 +79,7 @@ def free_run(model: Any, record: Data) -> list[Array] | None:
     """Simulated outputs, or None where an input is missing or the model runs away."""
     if not runs_free(model):
         return None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         try:
             return simulate_outputs(model, record)
         except DataError:
@@ -121,8 +115,7 @@ def interval_band(fit: "Fit", record: Data) -> tuple[list[Lines], str, tuple[str
     """Return the 95 % interval of the simulation of a record as a band, if any, what it contains, and remarks."""
     if not runs_free(fit.model):
         return [], "", ()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         try:
             found: list[Any] = as_list(fit.simulate(record, interval=0.95))
         except OptidError as error:
@@ -250,15 +243,14 @@ def bode_charts(models: dict[str, Any], levels: Levels, known: Any = None, hertz
     caption = (f"From input to output{reach}" + ", with the mean slope of f" * bent
                + ("; shaded: 95 % bands." if known is not None else "."))
     unit = ratio_unit(first)
-    size_axis = Axis(f"magnitude (dB of {unit})" if unit else "magnitude (dB)", unit="dB")
+    size_axis = Axis(with_unit("magnitude", f"dB of {unit}" if unit else "dB"), unit="dB")
     return [Chart("Bode diagram: magnitude", caption, frequency, size_axis, magnitude, "bode"),
             Chart("Bode diagram: phase", caption, frequency, Axis("phase (degrees)", unit="degrees"), phase, "bode")]
 
 
 def pole_chart(poles: dict[str, Array]) -> Chart:
     """Poles of models in the unit circle."""
-    angle = np.linspace(0, 2 * np.pi, 181)
-    series = [Series("", np.cos(angle), np.sin(angle), "line-only", "muted", width=1.2)]
+    series = [Series("", *CIRCLE, "line-only", "muted", width=1.2)]
     for k, (label, values) in enumerate(poles.items()):
         inside = np.abs(values) < 1
         series.append(Series(label or "poles", values[inside].real, values[inside].imag, "poles", COLOURS[k % 10]))
@@ -267,11 +259,6 @@ def pole_chart(poles: dict[str, Array]) -> Chart:
             series.append(Series(f"{label} unstable".strip(), outside.real, outside.imag, "poles", "red"))
     return Chart("Poles", "A stable model has all its poles inside the unit circle.", Axis("real part"),
                  Axis("imaginary part"), series, equal=True)
-
-
-def correlation_charts(checked: "Validation") -> list[Chart]:
-    """Every residual test with its 99 % band, its name and its outcome."""
-    return [correlation_chart(test) for test in checked.tests]
 
 
 def correlation_chart(test: Correlation) -> Chart:

@@ -21,15 +21,13 @@ def validation_tables(checked: "Validation") -> list[Table]:
          number(q.snr_amplitude, 3), str(q.samples))
         for name in checked.one_step
         for word, table in checked.predictors.items()
-        for q in (table[name],)
-    ]
+        for q in (table[name],)]
     tables = [Table("Errors", ("prediction", "fit %", "VAF %", "RMSE", "E_N", "SNR", "root SNR", "samples"), errors)]
     if checked.experiments:
         rows = [
             (f"{name}, experiment {k + 1}", *(percent(by[name][k].fit) for by in checked.experiments.values()))
             for name in checked.one_step
-            for k in range(len(next(iter(checked.experiments.values()))[name]))
-        ]
+            for k in range(len(next(iter(checked.experiments.values()))[name]))]
         tables.append(Table("Fit by experiment", ("output", *checked.experiments), rows))
     return [*tables, _test_table(checked)]
 
@@ -92,8 +90,7 @@ def facts_table(found: "Comparison") -> Table:
         (name, model.title,
          str(len(model.coefficients()) + sum(f.nonlinearity.mu.size for f in static_functions(model))),
          number(float(np.max(np.abs(model.poles), initial=0.0)), 4))
-        for name, model in zip(found.names, found.models)
-    ]
+        for name, model in zip(found.names, found.models)]
     return Table("Models", ("model", "kind", "coefficients", "largest pole"), rows)
 
 
@@ -119,5 +116,4 @@ def worst_block(trial: "Trial") -> str:
 
 def _row(word: str, trial: "Trial", chosen: bool) -> tuple[str, ...]:
     structure = f"{trial.candidate.formulation} {trial.candidate.words}"
-    return (f"{'* ' * chosen}{word}: {structure}", f"{trial.score:.1f}", worst_block(trial),
-            str(trial.parameters))
+    return (f"{'* ' * chosen}{word}: {structure}", f"{trial.score:.1f}", worst_block(trial), str(trial.parameters))

@@ -58,8 +58,7 @@ def _cards(found: Diagnosis) -> Facts:
         cards += [
             ("probability of the best answer", f"{found.best.posterior:.3f}"),
             (f"answers in the set of {100 * found.coverage:g} %", str(len(found.candidates))),
-            ("deflection", number(found.best.faults[0].deflection, 3)),
-        ]
+            ("deflection", number(found.best.faults[0].deflection, 3))]
     if found.remaining is not None:
         cards.append(("p-value of the residual", words.probability_words(found.remaining.p_value)))
     return cards
@@ -83,8 +82,7 @@ def answer_table(found: Diagnosis) -> Table:
             rows.append((
                 f"{place}. {fault.label}" if i == 0 else f"and {fault.label}",
                 f"{answer.posterior:.3f}" if i == 0 else "", words.onset_words(fault).removeprefix("onset "),
-                number(fault.deflection, 3), first,
-            ))
+                number(fault.deflection, 3), first))
             rows += [("", "", "", "", magnitude) for magnitude in more]
     percent = f"{100 * found.coverage:g} %"
     return Table("", ("fault", "probability", "onset", "deflection", "magnitude"), rows,

@@ -1,15 +1,12 @@
 """Texts of a diagnosis."""
 
-import textwrap
-
 import numpy as np
 
 from optid.data.description import listed_findings
 from optid.faults.diagnosis.answers import Diagnosis, Estimate
 from optid.faults.kinds import kind_of
-from optid.phrases import p_value
-
-WIDTH = 80
+from optid.phrases import and_joined, p_value
+from optid.show.terminal import wrap_lines
 
 HEADLINES = {
     "healthy": "no alarm",
@@ -70,8 +67,7 @@ def diagnosis_text(found: Diagnosis) -> str:
         *listed_findings(found.findings),
         f"{found.verdict}: {headline(found)}",
         f"{window_words(found)}, false alarm {found.false_alarm:g}, p-value {probability_words(found.p_value)}, "
-        f"method {found.method}",
-    ]
+        f"method {found.method}"]
     for answer in found.candidates:
         mark = "  <- best" * (answer is found.best)
         lines += ["", f"probability {answer.posterior:.3f}, gain {answer.gain:.1f}{mark}"]
@@ -82,11 +78,7 @@ def diagnosis_text(found: Diagnosis) -> str:
         lines += [remaining_words(found)]
     lines += [f"untestable: {label}, {why}" for label, why in found.untestable.items()]
     lines += [found.status] * bool(found.status)
-    result: list[str] = []
-    for line in lines:  # those that are too wide are broken, and keep their indent
-        indent = " " * (len(line) - len(line.lstrip()) + 2)
-        result += textwrap.wrap(line, WIDTH, subsequent_indent=indent, break_on_hyphens=False) or [""]
-    return "\n".join(result)
+    return wrap_lines(lines)
 
 
 def window_words(found: Diagnosis) -> str:
@@ -123,8 +115,7 @@ def certificate_words(found: Diagnosis) -> str:
     if proof.basis == "infeasible healthy":
         return (
             f"proof: no healthy course lies within the bounds of the noise unless they are {proof.value:.3g} times as "
-            "wide; the parity vector is kept"
-        )
+            "wide; the parity vector is kept")
     return "no proof"
 
 
@@ -134,8 +125,7 @@ def remaining_words(found: Diagnosis) -> str:
     assert rest is not None
     words = (
         f"left unexplained: energy {rest.energy:.0f} of {rest.readings} readings; the worst of four tests "
-        f"({rest.test}) has p-value {probability_words(rest.p_value)}"
-    )
+        f"({rest.test}) has p-value {probability_words(rest.p_value)}")
     return words if found.verdict != "unknown" else f"{words}; {course_words(found)}"
 
 
@@ -161,13 +151,12 @@ def diagnosis_sentences(found: Diagnosis, *, notes: bool = True) -> list[str]:
     """State in sentences the result, its probability and its evidence; notes add what was not judged."""
     name = found.model if found.model.startswith("Hammerstein") else found.model[:1].lower() + found.model[1:]
     departs = f"The record departs from the healthy {name} (p-value {probability_words(found.p_value)}), but "
-    silent = _list(list(found.untestable)) if found.untestable else ""
+    silent = and_joined(list(found.untestable))
     if found.verdict == "healthy":
         sentences = [
             f"The record of {found.window} samples agrees with the healthy {name}.",
             f"Healthy records depart as far from it with probability {probability_words(found.p_value)}; below "
-            f"{found.false_alarm:g} that would be an alarm.",
-        ]
+            f"{found.false_alarm:g} that would be an alarm."]
     elif found.verdict == "untestable" and found.detected:
         sentences = [f"{departs}the input does not excite the candidates: {silent}."]
     elif found.verdict == "untestable":
@@ -190,24 +179,17 @@ def diagnosis_sentences(found: Diagnosis, *, notes: bool = True) -> list[str]:
 def _faulty(found: Diagnosis) -> list[str]:
     best, *others = found.candidates
     phrase = " and ".join(
-        f"{fault.label} with {onset_words(fault)} and {_list(size_words(fault))}" for fault in best.faults
-    )
+        f"{fault.label} with {onset_words(fault)} and {and_joined(size_words(fault))}" for fault in best.faults)
     most = "most probably " * bool(others)
     first = f"The record is not healthy (p-value {probability_words(found.p_value)}): {most}{phrase}."
     if others:
-        shares = _list([f"{answer.label} ({answer.posterior:.2f})" for answer in others])
-        second = (
-            f"At {100 * found.coverage:g} % it (probability {best.posterior:.2f}) is not isolable from {shares}."
-        )
+        shares = and_joined([f"{answer.label} ({answer.posterior:.2f})" for answer in others])
+        second = f"At {100 * found.coverage:g} % it (probability {best.posterior:.2f}) is not isolable from {shares}."
     else:
         sure = f"No other candidate remains at {100 * found.coverage:g} %"
         second = f"{sure} (probability {best.posterior:.3f})."
     proof = certificate_words(found)
     return [first, second, proof[0].upper() + proof[1:] + "."]
-
-
-def _list(words: list[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def probability_words(value: float) -> str:

@@ -62,7 +62,12 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
         judged: the verdict on the model; that of the fit when not given.
         command: the command line behind the fit.
         advise: whether to say what would help a poor model, which takes time.
+
+    Raises:
+        DataError: the fit ended without a model.
     """
+    if fit.model is None:
+        raise DataError(f"there is no model to report: the fit ended with status '{fit.solution.status}'")
     lead = " · ".join(part for part in (fit.formulation, fit.data.name, _length(fit.data)) if part)
     curves = cache(lambda: responses.fit_responses(fit, estimates.uncertainty(fit)[0]))
     sections = [
@@ -80,8 +85,7 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
             page_only=True),
         Section("solver", "Solver and times", lambda: [summary.solver_facts(fit)], page_only=True),
         Section("reproduce", "Reproduce", lambda: reproduce(
-            "\n".join(part for part in (command, summary.call(fit)) if part), str(fit)), page_only=True),
-    ]
+            "\n".join(part for part in (command, summary.call(fit)) if part), str(fit)), page_only=True)]
     judgeable = isinstance(fit.data, Data)
     left_out = {"trust": not judgeable and judged is None, "constraints": not fit.prices,
                 "validation": not judgeable and test is None}
@@ -136,8 +140,7 @@ def record_document(data: Data, *, command: str = "") -> Document:
         Section("channels", "Channels", lambda: [summary.channel_table(data)]),
         Section("tests", "What the record tells", lambda: [informativity_table(informativity(data))]),
         Section("figures", "Figures", draw, page_only=True),
-        *([Section("reproduce", "Reproduce", [Code(command)], page_only=True)] if command else []),
-    ])
+        *([Section("reproduce", "Reproduce", [Code(command)], page_only=True)] if command else [])])
 
 
 def _length(data: Any) -> str:
@@ -226,8 +229,8 @@ def _test_charts(fit: "Fit", record: Data) -> list[Any]:
 
 def validation_parts(checked: Validation) -> list[Any]:
     """Return errors, tests, notes and the correlations of a validation."""
-    notes = [Notes(checked.notes)] if checked.notes else []
-    return [*checks.validation_tables(checked), *notes, Charts(charts.correlation_charts(checked))]
+    notes, drawn = [Notes(checked.notes)] if checked.notes else [], map(charts.correlation_chart, checked.tests)
+    return [*checks.validation_tables(checked), *notes, Charts([*drawn])]
 
 
 def reproduce(call: str, text: str) -> list[Any]:
@@ -323,12 +326,6 @@ def order_document(study: "OrderStudy") -> Document:
         Section("order", "Recommendation", [Banner("plain", f"nx = {study.nx}"), *notes,
                                             Charts(charts.order_charts(study)),
                                             Fold("Tables", [Code(order_text(study))])])])
-
-
-def require_model(fit: "Fit") -> None:
-    """Refuse a fit that ended without a model (`DataError`)."""
-    if fit.model is None:
-        raise DataError(f"there is no model to report: the fit ended with status '{fit.solution.status}'")
 
 
 def order_text(study: "OrderStudy") -> str:

@@ -1,18 +1,16 @@
 """What was estimated, as rows: coefficients and nonlinearities with their errors."""
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from optid.bases.splines import Triangular
+from optid.identify.fitting import Fit
 from optid.identify.parameters import Parameter, Parameters, coefficient_parameters, function_parameters
 from optid.identify.parameters import uncertainty_or_reason as uncertainty
 from optid.models.functions import static_functions
-from optid.show.wording import Table, number
-
-if TYPE_CHECKING:
-    from optid.identify.fitting import Fit
+from optid.show.wording import Table, number, with_unit
 
 MOST_NODES, EVEN = 20, 11
 """A piecewise linear f with fewer cells than the first is listed at its nodes, any other at so many points."""
@@ -21,7 +19,7 @@ MOST_ROWS, ABREAST = 12, 3
 """More coefficients than the first, without errors to show, are set in so many columns."""
 
 
-def parameter_tables(fit: "Fit") -> list[Table]:
+def parameter_tables(fit: Fit) -> list[Table]:
     """Estimates with their standard errors and 95 % intervals if available, then matrices without."""
     known, reason = uncertainty(fit)
     found = []
@@ -45,7 +43,7 @@ def _remark(known: Any) -> str:
     return f"The errors are {' and '.join(words)}; the standard errors account for it." if words else ""
 
 
-def nonlinearity_tables(fit: "Fit", inputs: bool) -> list[Table]:
+def nonlinearity_tables(fit: Fit, inputs: bool) -> list[Table]:
     """Values of nonlinearities at a few points, with their pointwise bands where there are some.
 
     Those of the inputs, in the gauge of the model, or those of outputs that are fed back and of latent signals.
@@ -58,7 +56,6 @@ def nonlinearity_tables(fit: "Fit", inputs: bool) -> list[Table]:
         f = function.nonlinearity
         basis: Any = f.basis
         points = basis.grid(basis.p + 1 if isinstance(basis, Triangular) and basis.p < MOST_NODES else EVEN)
-        label = f"{function.name} ({function.unit})" if function.unit else function.name
         if known is None:
             rows, head = [(number(u, 4), number(value)) for u, value in zip(points, f(points))], ()
         else:
@@ -68,11 +65,11 @@ def nonlinearity_tables(fit: "Fit", inputs: bool) -> list[Table]:
             rows = [interval_row(number(u, 4), *row, size=size) for u, *row in numeric]
             head = ("std. error", "95 % low", "95 % high")
         title = f"{function.what} {function.word}, basis {_basis(f.basis)}"
-        found.append(Table(title, (label, function.word, *head), rows))
+        found.append(Table(title, (with_unit(function.name, function.unit), function.word, *head), rows))
     return found
 
 
-def coefficient_table(fit: "Fit") -> Table | None:
+def coefficient_table(fit: Fit) -> Table | None:
     """Coefficients mu of the bases; None where every channel is linear."""
     known, _ = uncertainty(fit)
     functions = [function for function in static_functions(fit.model) if not function.is_linear]

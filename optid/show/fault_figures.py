@@ -9,10 +9,11 @@ from matplotlib.figure import Figure
 from optid.faults.diagnosis.answers import Diagnosis
 from optid.faults.isolability_study import Isolability
 from optid.faults.repair.reformulation import Reformulation
+from optid.phrases import short
 from optid.show.diagnosis import diagnosis_charts
 from optid.show.diagnosis_words import headline
 from optid.show.isolability import isolation_chart
-from optid.show.panels import draw_chart, plain, shorten, with_style
+from optid.show.panels import draw_chart, draw_charts, plain, with_style
 from optid.show.reformulation import explanation_names, reformulation_charts
 from optid.show.sections import Chart
 
@@ -35,12 +36,8 @@ def _drawn(charts: Sequence[Chart], most: int, size: tuple[float, float], title:
     columns = min(len(charts), most)
     rows = -(-len(charts) // columns)
     figure = Figure(figsize=(size[0] * columns + 0.6, size[1] * rows + 0.5), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax, chart in zip(axes, charts):
-        draw_chart(ax, chart)
-    for ax in axes[len(charts) :]:
-        ax.remove()
-    figure.suptitle(plain(shorten(title, 90)), weight="bold")
+    draw_charts(figure, charts, most)
+    figure.suptitle(plain(short(title, 90)), weight="bold")
     return figure
 
 
@@ -49,14 +46,13 @@ def isolability(found: Isolability) -> Figure:
     """Draw the deflections that isolate each fault from each other, and the probabilities by deflection."""
     needed = found.matrix * found.unit[:, None]
     count = len(found.labels)
-    names = [shorten(label, 22) for label in found.labels]
+    names = [short(label, 22) for label in found.labels]
     finite = needed[np.isfinite(needed) & (needed > 0)]
     figure = Figure(figsize=(10.0, 0.35 * count + 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     low, top = (float(finite.min()), float(finite.max())) if finite.size else (1.0, 10.0)
     shown = left.imshow(
-        np.where(np.isfinite(needed), needed, np.nan), cmap="YlOrBr", norm=LogNorm(low, max(top, 2 * low))
-    )
+        np.where(np.isfinite(needed), needed, np.nan), cmap="YlOrBr", norm=LogNorm(low, max(top, 2 * low)))
     for i in range(count):
         for j in range(count):
             word = f"{found.matrix[i, j]:.2g}" if np.isfinite(found.matrix[i, j]) else "never"

@@ -1,17 +1,15 @@
 """Figures of a record, of a comparison of models, and of a study of the order."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from optid.data.record import Data
 from optid.identify.order.study import OrderStudy
+from optid.identify.validation import Comparison
 from optid.show import charts, panels
 from optid.show.panels import CLOSEUP, plain, with_style
-
-if TYPE_CHECKING:
-    from optid.identify.validation import Comparison
 
 
 def channels(data: Data) -> Figure:
@@ -34,7 +32,7 @@ def channels(data: Data) -> Figure:
 
 
 @with_style
-def simulations(found: "Comparison") -> Figure:
+def simulations(found: Comparison) -> Figure:
     """Draw the measured outputs and every simulation; of a long record the stretch in which the outputs move most."""
     record, several = found.data, sum(bool(arrays) for arrays in found.simulated)
     figure = Figure(figsize=(9.0, 2.9 * record.l + 0.35 * several), layout="constrained")
@@ -55,13 +53,9 @@ def order_study(study: OrderStudy) -> Figure:
     """Draw singular values with thresholds, criteria and hold-out by number of states, and the scan of lags."""
     shown = charts.order_charts(study)
     figure = Figure(figsize=(8.6, 3.0 * -(-len(shown) // 2)), layout="constrained")
-    axes = figure.subplots(-(-len(shown) // 2), 2).ravel()
-    for ax, chart in zip(axes, shown):
-        panels.draw_chart(ax, chart)
+    axes = panels.draw_charts(figure, shown, 2)
     axes[2].set_yscale("symlog", linthresh=0.01)  # the first orders are far above, the others near the best
     axes[2].set_ylim(bottom=0)
-    for ax in axes[len(shown) :]:
-        ax.remove()
     scan = "" if study.lags is None else f"; {study.lags.best('bic')}"
     figure.suptitle(f"recommended: nx = {study.nx}{scan}")
     return figure

@@ -12,12 +12,10 @@ from optid.arrays import Array
 from optid.errors import OptidError
 from optid.identify.dynamics import Levels, mean_slopes, nearest_real
 from optid.models.functions import response_pairs, static_functions
-from optid.show.charts import COLOURS, frequencies, ratio_unit
+from optid.show.charts import CIRCLE, COLOURS, frequencies, ratio_unit
 from optid.show.sections import Axis, Chart, Series
 
 SPREAD = float(np.sqrt(-2 * np.log(0.05)))  # radius of a 95 % ellipse, in standard deviations
-ANGLES = np.linspace(0, 2 * np.pi, 181)
-CIRCLE = np.cos(ANGLES), np.sin(ANGLES)
 MARKED = 12  # frequencies whose regions are drawn
 FAR = 2.0  # zeros further out than this, in radii of the picture of the poles, are named instead of drawn
 RISING = 1.5  # ratio of the first response to that of a tenth of the frequencies, above which the model integrates

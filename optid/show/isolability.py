@@ -24,15 +24,13 @@ def describe(found: Isolability) -> str:
         f"window {found.window} samples, onset {where}, false alarm {found.false_alarm:g},",
         f"probability {found.prob:g} ({found.draws} simulated windows per fault)",
         "",
-        f"     {'fault':<23}{'detectable':>10}{'isolable':>9}  {'hardest to isolate from':<23}{'sine':>6}",
-    ]
+        f"     {'fault':<23}{'detectable':>10}{'isolable':>9}  {'hardest to isolate from':<23}{'sine':>6}"]
     for i, label in enumerate(found.labels):
         rival = found.rivals[i]
         sine = f"{found.sines[i, found.labels.index(rival)]:6.3f}" if rival else ""
         lines.append(
             f"{i + 1:>3}  {short(label, 22):<23}{_size(found.detectable[i]):>10}{_size(found.isolable[i]):>9}"
-            f"  {short(rival, 22):<23}{sine:>6}" + " *" * bool(found.bounded[i])
-        )
+            f"  {short(rival, 22):<23}{sine:>6}" + " *" * bool(found.bounded[i]))
     lines += ["", "smallest size at which the fault of a row is isolated from that of a column"]
     wide = 7
     fits = (80 - 5) // wide
@@ -41,8 +39,7 @@ def describe(found: Isolability) -> str:
         lines.append("     " + "".join(f"{j + 1:>{wide}}" for j in columns))
         lines += [
             f"{i + 1:>3}  " + "".join(f"{_size(found.matrix[i, j]):>{wide}}" for j in columns)
-            for i in range(len(found.labels))
-        ]
+            for i in range(len(found.labels))]
     notes = ["on the diagonal: smallest detectable size"]
     if found.bounded.any():
         notes.append("* transient: the signature decays, a longer window does not help")

@@ -5,13 +5,12 @@ import hashlib
 import json
 import platform
 import re
-from collections.abc import Callable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -19,10 +18,6 @@ from markupsafe import Markup
 
 from optid import __version__
 from optid.show.sections import Chart, Document, Series, extremes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 SCRIPTS = ("plot.js", "parts.js", "charts.js")
 
@@ -122,8 +117,7 @@ def template(name: str) -> Any:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        keep_trailing_newline=True,
-    ).get_template(name)
+        keep_trailing_newline=True).get_template(name)
 
 
 def versions() -> list[tuple[str, str]]:
@@ -132,18 +126,4 @@ def versions() -> list[tuple[str, str]]:
         ("optid", __version__),
         *((name, version(name)) for name in ("cvxpy", "numpy", "scipy")),
         ("Python", platform.python_version()),
-        ("Written", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
-    ]
-
-
-def figure(name: str, draw: Callable[[], "Figure"], caption: str) -> dict[str, Any]:
-    """Return a figure for the macro of the same name.
-
-    Args:
-        name: prefix of the identifiers inside.
-        draw: makes the figure.
-        caption: what stands below it, and for screen readers in place of it.
-    """
-    from optid.show.svg import inline
-
-    return {"svg": inline(draw(), name, caption), "caption": caption}
+        ("Written", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC")]

@@ -13,7 +13,6 @@ from matplotlib.patches import FancyBboxPatch
 from matplotlib.ticker import MaxNLocator
 
 from optid.arrays import Array
-from optid.data.timeline import Timeline
 from optid.show import sections
 from optid.show.sections import Axis, Chart, extremes
 
@@ -107,16 +106,6 @@ def plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def with_unit(name: str, unit: str) -> str:
-    """Return "name (unit)", or the name alone, as `plain` text."""
-    return plain(f"{name} ({unit})" if unit else name)
-
-
-def shorten(name: str, most: int = 18) -> str:
-    """Cut a long name, so that it fits above a small panel."""
-    return name if len(name) <= most else name[: most - 1] + "\N{HORIZONTAL ELLIPSIS}"
-
-
 def thin_line(t: Array, y: Array) -> tuple[Array, Array]:
     """Keep the extremes of every bin of a long line, so that no peak is lost; t, y (N,) become `POINTS` long."""
     if y.size <= POINTS:
@@ -140,12 +129,6 @@ def show_dates(ax: Axes) -> None:
     ax.xaxis.label.set(x=0, horizontalalignment="left")
     ax.xaxis.set_major_locator(locator)
     ax.xaxis.set_major_formatter(ConciseDateFormatter(locator))
-
-
-def show_times(ax: Axes, timeline: Timeline) -> None:
-    """Set the ticks of an x axis of samples, with their times below where the unit of time is known."""
-    ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    ax.xaxis.set_major_formatter(lambda k, _: f"{k:.0f}\n{timeline.text(round(k))}".rstrip())
 
 
 def liveliest(y: Array) -> slice:
@@ -193,6 +176,17 @@ def draw_chart(ax: Axes, chart: Chart, legend: bool = True, title: str = "") -> 
         ax.grid(False)
     if legend and sum(bool(one.name) for one in chart.series) > 1:
         ax.legend(loc="best", handlelength=1.6)
+
+
+def draw_charts(figure: Any, charts: Sequence[Chart], most: int = 3) -> Any:
+    """Draw charts in rows of at most so many, and return their axes."""
+    columns = min(len(charts), most)
+    axes = figure.subplots(-(-len(charts) // columns), columns, squeeze=False).ravel()
+    for ax, chart in zip(axes, charts):
+        draw_chart(ax, chart)
+    for ax in axes[len(charts) :]:
+        ax.remove()
+    return axes
 
 
 def draw_gap(ax: Axes, gap: float, threshold: float) -> None:

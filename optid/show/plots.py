@@ -3,7 +3,6 @@
 Long records are thinned to the extremes of every bin, so that figures stay small and no peak is lost.
 """
 
-from collections.abc import Sequence
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,9 +15,10 @@ from optid.identify.dynamics import input_levels
 from optid.identify.validation import Validation
 from optid.lazy import public_names
 from optid.models.functions import static_functions
+from optid.phrases import short
 from optid.show import charts, frequency, panels, responses
 from optid.show.estimates import uncertainty
-from optid.show.panels import CLOSEUP, MUTED, attempt_panels, liveliest, plain, shorten, with_style
+from optid.show.panels import CLOSEUP, MUTED, attempt_panels, liveliest, plain, with_style
 from optid.show.sections import Chart
 
 if TYPE_CHECKING:
@@ -31,6 +31,9 @@ TEST = "test record"
 
 RUNGS = {"instant": "instant proof", "ascent": "dual ascent", "sdp": "SDP", "product cuts": "product cuts"}
 """The ladder of proofs of a rank-one programme, cheapest first."""
+
+NARROW = 18
+"""Characters of a name above a small panel."""
 
 THRESHOLD = 1e-8
 """Relative gap that counts as a proof."""
@@ -58,7 +61,7 @@ def overview(fit: "Fit", test: Data | None = None) -> Figure:
     left, right = rows[1:3] if rows_of_f else rows[1].subfigures(1, 2, width_ratios=[1, 1.45]) if functions else (
         None, rows[1])
     if left is not None:
-        attempt_panels(left, "Characteristics", lambda part: _panels(part, _functions(fit)))
+        attempt_panels(left, "Characteristics", lambda part: panels.draw_charts(part, _functions(fit)))
     attempt_panels(right, "The dynamics", lambda part: _dynamics_panels(part, fit))
     attempt_panels(rows[-1], "The residual tests", lambda part: _residual_panels(
         part, _validated(model, record), record, outputs=1, inputs=min(model.m, 2)))
@@ -94,25 +97,24 @@ def nonlinearity(fit: "Fit") -> Figure:
     if not count:
         raise DataError(f"a model of {fit.formulation!r} has no static functions to draw")
     figure = Figure(figsize=(9.0 if count > 1 else 6.4, 3.4 * -(-count // 3)), layout="constrained")
-    _panels(figure, charts.nonlinearity_charts(fit, linear=True))
+    panels.draw_charts(figure, charts.nonlinearity_charts(fit, linear=True))
     return figure
 
 
 @with_style
-def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | None = None) -> Figure:
+def residual_tests(fit: "Fit", data: Data | None = None) -> Figure:
     """Draw autocorrelations of the residuals and their cross-correlations with the inputs, with 99 % bands.
 
     Args:
         fit: the fit.
         data: the record; the estimation record when not given.
-        checked: the result of `optid.validate` on it, if available.
 
     Raises:
         DataError: the fit was made from a stream and no record is given.
     """
     record = _record(fit, data)
     figure = Figure(figsize=(9.0, 2.5 * record.l), layout="constrained")
-    _residual_panels(figure, checked or _validated(fit.model, record), record, outputs=record.l, inputs=record.m)
+    _residual_panels(figure, _validated(fit.model, record), record, outputs=record.l, inputs=record.m)
     return figure
 
 
@@ -121,7 +123,7 @@ def poles_and_response(fit: "Fit") -> Figure:
     """Draw poles, and frequency response and step responses from input to output, with 95 % bands."""
     figure = Figure(figsize=(10.0, 3.3 * -(-(2 + fit.model.m * fit.model.l) // 3)), layout="constrained")
     steps = [one.chart for one in _drawn(fit) if one.curve.kind == "step"]
-    _panels(figure, [*_dynamics(fit), *steps])
+    panels.draw_charts(figure, [*_dynamics(fit), *steps])
     return figure
 
 
@@ -183,7 +185,7 @@ def noise(fit: "Fit") -> Figure:
         StructureError: the model has no noise covariances.
     """
     figure = Figure(figsize=(6.4, 3.0), layout="constrained")
-    _panels(figure, [charts.noise_chart(fit.model)])
+    panels.draw_charts(figure, [charts.noise_chart(fit.model)])
     return figure
 
 
@@ -216,12 +218,8 @@ def singular_values(fit: "Fit") -> Figure:
     Raises:
         DataError: the formulation has no matrix Theta.
     """
-    found = charts.theta_charts(fit)
-    if not found:
-        raise DataError(f"formulation {fit.formulation!r} has no matrix Theta with more than one row and column")
-    figure = Figure(figsize=(min(9.0, 3.4 * len(found) + 1.0), 2.9), layout="constrained")
-    _panels(figure, found)
-    return figure
+    return _row(charts.theta_charts(fit), 3.4, f"formulation {fit.formulation!r} has no matrix Theta with more than "
+                "one row and column")
 
 
 @with_style
@@ -231,11 +229,15 @@ def spectra(fit: "Fit") -> Figure:
     Raises:
         DataError: the formulation has none.
     """
-    found = charts.spectrum_charts(fit)
-    if not found:
-        raise DataError(f"formulation {fit.formulation!r} reports no singular values")
-    figure = Figure(figsize=(min(9.0, 4.4 * len(found) + 1.0), 2.9), layout="constrained")
-    _panels(figure, found)
+    return _row(charts.spectrum_charts(fit), 4.4, f"formulation {fit.formulation!r} reports no singular values")
+
+
+def _row(shown: list[Chart], width: float, none: str) -> Figure:
+    """Draw charts of a width in inches in a row; `DataError` with a reason where there are none."""
+    if not shown:
+        raise DataError(none)
+    figure = Figure(figsize=(min(9.0, width * len(shown) + 1.0), 2.9), layout="constrained")
+    panels.draw_charts(figure, shown)
     return figure
 
 
@@ -292,16 +294,6 @@ def _closeup(ax: Any, below: Any, chart: Chart) -> None:
     below.set_ylabel("close-up")
 
 
-def _panels(figure: Any, shown: Sequence[Chart]) -> None:
-    """Draw charts in rows of up to three."""
-    columns = min(len(shown), 3)
-    axes = figure.subplots(-(-len(shown) // columns), columns, squeeze=False).ravel()
-    for ax, chart in zip(axes, shown):
-        panels.draw_chart(ax, chart)
-    for ax in axes[len(shown) :]:
-        ax.set_axis_off()
-
-
 def _validated(model: Any, record: Data) -> Validation | str:
     """Return the validation, or the reason why there is none."""
     try:
@@ -321,9 +313,9 @@ def _residual_panels(figure: Any, checked: Validation | str, record: Data, outpu
         tests += [checked.cross_correlations[name, channel] for channel in record.inputs[:inputs]]
         for k, test in enumerate(tests):
             ax = next(axes)
-            title = "Autocorrelation" if test.input is None else f"With past {shorten(test.input)}"
+            title = "Autocorrelation" if test.input is None else f"With past {short(test.input, NARROW)}"
             panels.draw_chart(ax, charts.correlation_chart(test), legend=False, title=title)
-            ax.set_ylabel("" if k else plain(f"residual of {shorten(name)}"))
+            ax.set_ylabel("" if k else plain(f"residual of {short(name, NARROW)}"))
 
 
 def _dynamics(fit: "Fit") -> list[Chart]:

@@ -80,16 +80,10 @@ def describe_parameters(found: "Parameters") -> str:
 
 def describe_search(found: "Identification") -> str:
     """Return the search and the fit it ended with as text, at most 80 columns wide."""
-    return "\n".join([*findings_lines(found.fit.record_findings), *search_lines(found), "",
-                      describe(found.fit, found.verdict, findings=False)])
-
-
-def search_lines(found: "Identification") -> list[str]:
-    """Return the table of the best structures by class, and the reasons of the choice, line by line."""
-    lines = set_table(checks.search_table(found))
+    lines = [*findings_lines(found.fit.record_findings), *set_table(checks.search_table(found))]
     lines += [line for reason in found.reasons for line in wrap_sentence(f"- {reason}")]
     chosen = found.chosen.candidate
     lines += ["", *wrap_sentence(f"Chosen: --formulation {chosen.formulation} {chosen.words}", "    ")]
     if found.stopped:
         lines += wrap_sentence(f"Note: {found.ended}")
-    return lines
+    return "\n".join([*lines, "", describe(found.fit, found.verdict, findings=False)])

@@ -1,18 +1,14 @@
 """What a record can tell, as a table and as text."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from optid.identify.informativity import Informativity
 from optid.phrases import p_equals
 from optid.show.terminal import set_table, wrap_sentence
 from optid.show.wording import Table, number
 
-if TYPE_CHECKING:
-    from optid.identify.informativity import Informativity
 
-
-def informativity_table(told: "Informativity") -> Table:
+def informativity_table(told: Informativity) -> Table:
     """Effect, dead time, gain and time constants of every input on every output, in samples."""
     rows = []
     for o, process in enumerate(told.processes):
@@ -30,7 +26,7 @@ def informativity_table(told: "Informativity") -> Table:
                  "Lags and time constants in samples, of a model of low order; in brackets the 95 % interval.")
 
 
-def describe_informativity(told: "Informativity") -> str:
+def describe_informativity(told: Informativity) -> str:
     """Return what a record can tell as text, at most 80 columns wide."""
     lines = [line for sentence in told.findings for line in wrap_sentence(f"- {sentence}")]
     if told.untested:

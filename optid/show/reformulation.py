@@ -1,6 +1,5 @@
 """A reformulation as a page: actuators before and after the fault, attainable outputs, sensors."""
 
-import textwrap
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +13,7 @@ from optid.phrases import short
 from optid.show import page
 from optid.show.documents import reproduce
 from optid.show.sections import Axis, Banner, Chart, Charts, Code, Document, Facts, Heading, Notes, Section, Series
+from optid.show.terminal import wrap_lines
 from optid.show.wording import Table, number
 
 TONES = {"healthy": "good", "refitted": "good", "as diagnosed": "fair", "not repaired": "fair", "ambiguous": "bad"}
@@ -46,10 +46,7 @@ def describe(found: Reformulation) -> str:
     heads = [f"{one.label} (probability {one.damage.posterior:.3g})" for one in found.members]
     text = "\n".join([HEADS[found.status], *heads, *(str(one) for one in told if one is not None)])
     known = {line.strip() for line in text.splitlines()}
-    lines = text.splitlines() + [f"note: {note}" for note in found.notes if note.strip() not in known]
-    return "\n".join(
-        textwrap.fill(line, 80, subsequent_indent=" " * (len(line) - len(line.lstrip()) + 4),
-                      break_long_words=False, break_on_hyphens=False) for line in lines)
+    return wrap_lines(text.splitlines() + [f"note: {note}" for note in found.notes if note.strip() not in known])
 
 
 def reformulation_document(found: Reformulation, *, record: str = "", command: str = "") -> Document:
@@ -75,8 +72,7 @@ def _sentences(found: Reformulation) -> list[str]:
     if found.schedule is not None:
         lines.append(
             f"The model was refitted from {found.schedule.samples} samples after the fault: {found.schedule.stage} "
-            f"({found.schedule.reason})."
-        )
+            f"({found.schedule.reason}).")
     if found.observer.lost:
         lines.append(f"{', '.join(found.observer.lost)}: not used; the filter on the other sensors estimates them.")
     return lines
@@ -100,12 +96,10 @@ def _tables(found: Reformulation) -> list[Table]:
     for one in () if found.schedule is None else found.schedule.values:
         rows = [
             (number(u, 4), number(old, 4), number(new, 4), number(std, 2), "prior only" if unseen else "")
-            for u, old, new, std, unseen in zip(one.nodes, one.healthy, one.values, one.std, one.prior_only)
-        ]
+            for u, old, new, std, unseen in zip(one.nodes, one.healthy, one.values, one.std, one.prior_only)]
         note = (
             f"Inputs after the fault from {one.seen[0]:.4g} to {one.seen[1]:.4g}; smallest eigenvalue of the "
-            f"information on the values with samples {one.excitation:.3g}. Standard errors: without constraints."
-        )
+            f"information on the values with samples {one.excitation:.3g}. Standard errors: without constraints.")
         tables.append(Table(f"Effect of {one.name}", ("input", "before", "now", "standard error", ""), rows, note))
     seen = found.observer
     if not seen.lost:
@@ -114,8 +108,7 @@ def _tables(found: Reformulation) -> list[Table]:
              number(seen.open_loop[name], 3)) for name, value in seen.rmse.items()]
     tables.append(Table(
         "Outputs", ("output", "sensor", "predicted RMSE", "noise of the sensor", "RMSE of a simulation"), rows,
-        "Of the outputs without their noise, from the Riccati equation of the filter on the used sensors.",
-    ))
+        "Of the outputs without their noise, from the Riccati equation of the filter on the used sensors."))
     return tables
 
 
@@ -169,7 +162,7 @@ def _attainable(found: Reformulation) -> list[Chart]:
             sets.insert(0, (before, "muted", "before", "4 2"))
     series = []
     for allocation, colour, name, dash in sets:
-        if allocation is not None and allocation.problem.linear:
+        if allocation is not None and allocation.linear:
             corners = allocation.corners()
             around = np.vstack([corners, corners[:1]])
             kind = "line-only" if len(corners) > 1 else "dots"

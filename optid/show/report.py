@@ -30,13 +30,11 @@ def write(fit: "Fit", path: str | Path, test: Data | None = None, *, command: st
         DataError: the fit has no model to report.
         OSError: the file cannot be written.
     """
-    documents.require_model(fit)
     return page.write(documents.fit_document(fit, test, command=command), path)
 
 
 def render(fit: "Fit", test: Data | None = None, *, command: str = "") -> str:
     """Return the page that `write` writes."""
-    documents.require_model(fit)
     return page.render(documents.fit_document(fit, test, command=command))
 
 

@@ -10,10 +10,10 @@ from optid.data.record import Data
 from optid.identify.dynamics import dynamics, input_levels, integration
 from optid.identify.responses import LONGEST, Response, responses, step_samples
 from optid.models.functions import static_functions
-from optid.show.charts import COLOURS, channel_axis, density, response_axis
+from optid.show.charts import COLOURS, channel_axis, density
 from optid.show.estimates import interval_row
 from optid.show.sections import Axis, Chart, Series
-from optid.show.wording import Table, number
+from optid.show.wording import Table, number, time_title
 
 ROWS, TIMES, LEVELS = 11, 6, 5
 """Rows of a table of a characteristic and of a step response, and columns of those that compare models."""
@@ -63,7 +63,8 @@ def _chart(part: list[tuple[str, Response, str]], model: Any, record: Data | Non
     if first.kind == "step":
         title = f"Step response of {name} to {channel} from {low:.3g} to {high:.3g}"
         caption = f"Change of {name} as {channel} goes from one level to the other."
-        return Chart(title, caption, response_axis(model), channel_axis(name, unit), series, height=300)
+        time = Axis(time_title(model.time_unit, model.dt == 1))
+        return Chart(title, caption, time, channel_axis(name, unit), series, height=300)
     if record is not None:
         samples = np.concatenate([e.u[:, first.input] for e in record.experiments])
         samples = samples[np.isfinite(samples) & (samples >= low) & (samples <= high)]

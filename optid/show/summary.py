@@ -1,8 +1,8 @@
 """Facts, tables and sentences about a fit, for the printed result and the HTML page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -10,19 +10,16 @@ from optid.core.least_squares import RankOneForm
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.identify.equation_error import EquationError
+from optid.identify.fitting import Fit
 from optid.identify.validation.predictions import predictors
-from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT
+from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT, Verdict
 from optid.models.functions import has_feedback, runs_free, static_functions
 from optid.models.kalman import NoiseCovariances
 from optid.models.roots import in_words
-from optid.phrases import seconds
+from optid.phrases import and_joined, seconds
 from optid.program.solution import Solution, Status
 from optid.show.sections import Facts
-from optid.show.wording import Table, gap_text, number, percent
-
-if TYPE_CHECKING:
-    from optid.identify.fitting import Fit
-    from optid.identify.verdict import Verdict
+from optid.show.wording import Table, gap_text, number, percent, with_unit
 
 MOST = 12
 """Entries of an array among the figures that are printed."""
@@ -33,13 +30,13 @@ PRICE_NOTE = (
 )
 
 
-def title(fit: "Fit") -> str:
+def title(fit: Fit) -> str:
     """Name the kind of model, its outputs and its inputs."""
     model = fit.model
-    return f"{model.title} of {_and(model.outputs)} from {_and(model.inputs)}"
+    return f"{model.title} of {and_joined(model.outputs)} from {and_joined(model.inputs)}"
 
 
-def verdict(fit: "Fit") -> tuple[str, str, str]:
+def verdict(fit: Fit) -> tuple[str, str, str]:
     """Return a tone ("good", "fair", "bad"), the status in words, and one sentence that explains it."""
     solution = fit.solution
     bound, gap = solution.bound, solution.gap
@@ -61,7 +58,7 @@ def verdict(fit: "Fit") -> tuple[str, str, str]:
     return "fair", word, f"A local optimum; whether a better one exists is not known{because}."
 
 
-def judgement(found: "Verdict") -> str:
+def judgement(found: Verdict) -> str:
     """Return the tests of a verdict that fail, or what a good model would show, in a sentence."""
     if found.failed:
         return f"FAIL: {'; '.join(f'{part.name} ({part.value})' for part in found.failed)}."
@@ -69,7 +66,7 @@ def judgement(found: "Verdict") -> str:
     return "All tests of the verdict pass." + more * (found.word != GOOD)
 
 
-def verdict_table(found: "Verdict") -> Table:
+def verdict_table(found: Verdict) -> Table:
     """The tests behind the verdict on a model, each with its value and outcome."""
     cut = [(part, *part.value.partition(": ")[::2]) if part.outcome == "-" else (part, part.value, "")
            for part in found.parts]  # the reason why a test is not available is a sentence, and no cell
@@ -77,7 +74,7 @@ def verdict_table(found: "Verdict") -> Table:
     return Table("", ("test", "value", "outcome"), [(part.name, value, part.outcome) for part, value, _ in cut], note)
 
 
-def fit_table(fit: "Fit") -> Table:
+def fit_table(fit: Fit) -> Table:
     """Fit of every output on the estimation record, by every predictor that the model has."""
     columns = [np.atleast_1d(fit.one_step_fit)]
     if has_feedback(fit.model):
@@ -87,7 +84,7 @@ def fit_table(fit: "Fit") -> Table:
     return Table("Fit on the estimation record", ("output", *predictors(fit.model)), rows)
 
 
-def simulation_fit(fit: "Fit") -> np.ndarray:
+def simulation_fit(fit: Fit) -> np.ndarray:
     """Simulation fit of every output in %; NaN where there is none: see `Fit.simulation_fit`, or an unstable model.
 
     With nonlinear feedback the poles of the linear part do not decide about stability; the simulation does.
@@ -97,7 +94,7 @@ def simulation_fit(fit: "Fit") -> np.ndarray:
     return np.atleast_1d(fit.simulation_fit)
 
 
-def constraint_table(fit: "Fit") -> Table:
+def constraint_table(fit: Fit) -> Table:
     """Activity, slack and price of every user constraint."""
     rows = []
     for p in fit.prices:
@@ -108,7 +105,7 @@ def constraint_table(fit: "Fit") -> Table:
     return Table("Constraints", ("constraint", "state", "slack", "multiplier", "price"), rows, PRICE_NOTE)
 
 
-def certificate_facts(fit: "Fit") -> Facts:
+def certificate_facts(fit: Fit) -> Facts:
     """Status claimed by the solver, whether it returned a solution, the proof, and the residuals measured by optid."""
     s, r = fit.solution, fit.solution.residuals
     facts = [("Solver status", f"{s.solver}: {s.claimed}"), ("Solution returned", "yes" if s.has_point else "no")]
@@ -128,14 +125,13 @@ def certificate_facts(fit: "Fit") -> Facts:
     return facts
 
 
-def record_facts(fit: "Fit") -> Facts:
+def record_facts(fit: Fit) -> Facts:
     """Name, length, experiments, missing samples and rows used."""
     data, figures = fit.data, fit.figures
     count = data.n_samples
     facts = [
         ("Record", data.name or "unnamed"),
-        ("Samples", (f"{count} every {data.interval}" if count else f"every {data.interval}")),
-    ]
+        ("Samples", (f"{count} every {data.interval}" if count else f"every {data.interval}"))]
     if isinstance(data, Data):
         facts.append(("Experiments", str(data.n_experiments)))
         if data.dated:
@@ -152,12 +148,12 @@ def record_facts(fit: "Fit") -> Facts:
     return facts
 
 
-def evidence_facts(fit: "Fit") -> Facts:
+def evidence_facts(fit: Fit) -> Facts:
     """Figures that a procedure of several steps reported, under its own names and in its order."""
     return [(name[:1].upper() + name[1:], _measured(value)) for name, value in fit.figures.items() if name not in _ROWS]
 
 
-def spectra(fit: "Fit") -> dict[str, np.ndarray]:
+def spectra(fit: Fit) -> dict[str, np.ndarray]:
     """Return the singular values and other falling sequences among the figures of a procedure, by their names."""
     named = {name: value for name, value in fit.figures.items() if "singular" in name.lower()}
     lists = {name: value for name, value in named.items() if isinstance(value, np.ndarray | list | tuple)}
@@ -165,7 +161,7 @@ def spectra(fit: "Fit") -> dict[str, np.ndarray]:
     return {name: values for name, values in found.items() if values.ndim == 1 and values.size > 1}
 
 
-def theta_singular_values(fit: "Fit") -> dict[str, np.ndarray]:
+def theta_singular_values(fit: Fit) -> dict[str, np.ndarray]:
     """Return the singular values of Theta by input: of the relaxed programme, or of least squares without the rank.
 
     Inputs whose Theta is a vector are left out.
@@ -194,12 +190,11 @@ def channel_table(data: Data) -> Table:
     rows = [
         (c.name, c.role, c.unit or "-", *(number(value, 4) for value in (c.low, c.high, c.mean, c.std)),
          str(c.levels) if c.levels <= 1000 else "many", f"{c.missing:.2%}")
-        for c in data.raw().channels
-    ]
+        for c in data.raw().channels]
     return Table("Channels", ("channel", "role", "unit", "lowest", "highest", "mean", "std", "levels", "missing"), rows)
 
 
-def solver_facts(fit: "Fit") -> Facts:
+def solver_facts(fit: Fit) -> Facts:
     """The solver, why it was chosen, and the time of each part."""
     s = fit.solution
     descended = fit.figures.get("programmes") == 1 and not fit.problem.constraint_names
@@ -215,7 +210,7 @@ def solver_facts(fit: "Fit") -> Facts:
     return facts + [(name, seconds(spent)) for name, spent in [*times, ("Total", fit.total_seconds)]]
 
 
-def steps_table(fit: "Fit") -> Table | None:
+def steps_table(fit: Fit) -> Table | None:
     """Every step of a procedure: its programmes, their solvers, status and objective of the last; None for one step."""
     by_name: dict[str, list[Solution]] = {}
     for name, solution in fit.steps:
@@ -228,22 +223,22 @@ def steps_table(fit: "Fit") -> Table | None:
                  f"The objective of the fit is that of the step '{fit.problem.name}'.")
 
 
-def call(fit: "Fit") -> str:
+def call(fit: Fit) -> str:
     """Write the Python call behind the fit; constraints by their names."""
-    words = [f"{key}={_argument(value)}" for key, value in fit.arguments.items() if key != "constraints"]
+    words = [f"{key}={value.tolist() if isinstance(value, np.ndarray) else value!r}"
+             for key, value in fit.arguments.items() if key != "constraints"]
     if fit.arguments.get("constraints"):
         names = [getattr(constraint, "name", None) or "a user function" for constraint in fit.arguments["constraints"]]
         words.append(f"constraints=[{', '.join(names)}]")
     return f"optid.fit(data, {fit.formulation!r}, {', '.join(words)})"
 
 
-def model_facts(fit: "Fit") -> Facts:
+def model_facts(fit: Fit) -> Facts:
     """Orders, poles, noise, gauge, extrapolation of f, and why its offset is not identifiable."""
     model = fit.model
     facts = [
         ("Orders", ", ".join(f"{name} {' '.join(map(str, np.atleast_1d(n)))}" for name, n in model.orders.items())),
-        ("Poles", in_words(model.poles) or "none"),
-    ]
+        ("Poles", in_words(model.poles) or "none")]
     if isinstance(noise := getattr(model, "noise", None), str) and noise:
         facts.append(("Noise", noise))
     if model.levels is not None:
@@ -267,14 +262,13 @@ def _gauge(model: Any) -> str:
         "norm": "norm of b is one",
         "gain": "static gain of the linear part is one",
         "b0": "first coefficient of b is one",
-        "none": "",
-    }
+        "none": ""}
     words = known.get(model.gauge, str(model.gauge))
     if model.gauge != "norm":
         return words
     functions = [function for function in static_functions(model) if function.family == "nonlinearities"]
     falls = [function.word for function, sign in zip(functions, model.gain_signs) if sign < 0]
-    return f"{words}; the output {'falls' if falls else 'rises'} with {_and(falls) if falls else 'f'}"
+    return f"{words}; the output {'falls' if falls else 'rises'} with {and_joined(falls) if falls else 'f'}"
 
 
 def has_noise(model: Any) -> bool:
@@ -282,7 +276,7 @@ def has_noise(model: Any) -> bool:
     return isinstance(getattr(model, "noise", None), NoiseCovariances)
 
 
-def noise_table(fit: "Fit") -> Table | None:
+def noise_table(fit: Fit) -> Table | None:
     """Innovations, noise at the outputs and its colour for a state-space model with noise covariances."""
     model = fit.model
     if not has_noise(model):
@@ -299,13 +293,11 @@ def noise_table(fit: "Fit") -> Table | None:
     for name, unit, innovation, total in zip(model.outputs, model.output_units, own, spread):
         test = tests.get(name)
         word = "-" if test is None or np.isnan(test.p_value) else "white" if test.passed else "coloured"
-        label = f"{name} ({unit})" if unit else name
         p_value = "-" if test is None else number(test.p_value, 2)
-        rows.append((label, number(innovation, 4), number(total, 4), word, p_value))
+        rows.append((with_unit(name, unit), number(innovation, 4), number(total, 4), word, p_value))
     note = (
         "Standard deviations. Q, R and S (model.noise) are those of the innovation form; others with the same spectrum "
-        "explain the record equally well."
-    )
+        "explain the record equally well.")
     return Table("Noise", ("output", "innovations", "noise at output", "colour", "p value"), rows, note)
 
 
@@ -326,13 +318,3 @@ def _measured(value: Any) -> str:
         return number(float(array), 5)
     shown = " ".join(number(float(entry), 4) for entry in array.ravel()[:MOST])
     return shown + (f" ... ({array.size} in all)" if array.size > MOST else "")
-
-
-def _argument(value: Any) -> str:
-    if isinstance(value, np.ndarray):
-        return repr(value.tolist())
-    return repr(value)
-
-
-def _and(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,6 +1,6 @@
 """Documents as text of 80 columns, which can be pasted into a paper."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 from textwrap import wrap
 
@@ -53,6 +53,11 @@ def _rule(sign: str) -> str:
 def wrap_sentence(text: str, indent: str = "  ") -> list[str]:
     """Break a sentence into lines of the page, those after the first indented."""
     return wrap(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False) or [""]
+
+
+def wrap_lines(lines: Iterable[str]) -> str:
+    """Break the lines that are too wide; they keep their indent."""
+    return "\n".join(part for line in lines for part in wrap_sentence(line, " " * (len(line) - len(line.lstrip()) + 2)))
 
 
 def _equation(text: str) -> list[str]:

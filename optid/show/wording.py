@@ -21,9 +21,14 @@ def number(value: float, digits: int = 5) -> str:
     return "-" if value is None or np.isnan(value) else f"{value:.{digits}g}"
 
 
+def with_unit(name: str, unit: str) -> str:
+    """Write "name (unit)", or the name alone."""
+    return f"{name} ({unit})" if unit else name
+
+
 def time_title(time_unit: str, counts_samples: bool = True) -> str:
     """Return the title of an axis of time; where the unit is unknown, time counts samples or has no unit."""
-    return f"time ({time_unit})" if time_unit else "sample" if counts_samples else "time"
+    return with_unit("time", time_unit) if time_unit else "sample" if counts_samples else "time"
 
 
 def frequency_title(model: Any, hertz: bool = False) -> str:

@@ -89,7 +89,7 @@ def verdict_view(fit: Any) -> dict[str, Any]:
     found, checked = fit.verdict, charts.validate_quietly(fit.model, fit.data.raw())
     return {"word": found.word, "tone": TONES[found.word], "sentence": summary.judgement(found),
             "parts": [[part.name, part.value, part.outcome] for part in found.parts],
-            "charts": [encode_chart(one) for one in charts.correlation_charts(checked)]}
+            "charts": [encode_chart(charts.correlation_chart(test)) for test in checked.tests]}
 
 
 def _finite(value: float) -> float | None:

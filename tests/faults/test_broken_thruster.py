@@ -2,16 +2,11 @@
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from commands import run
 
 import optid
-from optid.cli.app import app
 from optid.examples import example
 from optid.faults import load_diagnosis
-
-
-def run(*words):
-    return CliRunner().invoke(app, list(map(str, words)))
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,10 @@ import re
 
 import numpy as np
 import pytest
+from commands import run
 from fault_plants import levels
 from test_fault_injection import small
-from typer.testing import CliRunner
 
-from optid.cli.app import app
 from optid.faults import Fault, diagnose, dictionary, inject, load_diagnosis
 
 
@@ -28,15 +27,11 @@ def write(path, u, y, names="u1,u2,y1,y2"):
     np.savetxt(path, np.hstack([u, y]), delimiter=",", header=names, comments="", fmt="%.17g")
 
 
-def run(*words):
-    return CliRunner().invoke(app, ["diagnose", *map(str, words)])
-
-
 @pytest.mark.slow
 def test_a_record_becomes_a_diagnosis_a_page_and_a_picture(folder, tmp_path):
     out, page, picture = tmp_path / "d.json", tmp_path / "d.html", tmp_path / "d.png"
-    result = run(folder / "model.json", folder / "faulty.csv", "--kinds", "bias", "--out", out, "--report", page,
-                 "--picture", picture)
+    result = run("diagnose", folder / "model.json", folder / "faulty.csv", "--kinds", "bias", "--out", out, "--report",
+                 page, "--picture", picture)
     assert result.exit_code == 0, result.output
     assert "faulty: sensor:y2" in result.output and "diagnosis written to" in result.output
     found = load_diagnosis(out)
@@ -52,15 +47,15 @@ def test_a_record_becomes_a_diagnosis_a_page_and_a_picture(folder, tmp_path):
 
 @pytest.mark.slow
 def test_two_faults_and_the_other_options(folder):
-    two = run(folder / "model.json", folder / "crossing.csv", "-k", "bias", "--max-faults", "2", "--coverage", "0.9",
-              "--false-alarm", "0.02", "--seed", "3", "--no-state-jump", "--load", "pump=0.3,-0.2,0.5", "--robust")
+    two = run("diagnose", folder / "model.json", folder / "crossing.csv", "-k", "bias", "--max-faults", 2, "--coverage",
+              0.9, "--false-alarm", "0.02", "--seed", "3", "--no-state-jump", "--load", "pump=0.3,-0.2,0.5", "--robust")
     assert two.exit_code == 0, two.output
     assert "actuator:u1" in two.output and "false alarm 0.02" in two.output
 
 
 def test_a_healthy_record_is_told_as_such_and_exits_well(folder, tmp_path):
     page = tmp_path / "h.html"
-    result = run(folder / "model.json", folder / "sound.csv", "--kinds", "bias", "--report", page)
+    result = run("diagnose", folder / "model.json", folder / "sound.csv", "--kinds", "bias", "--report", page)
     assert result.exit_code == 0 and "healthy: no alarm" in result.output
     assert "Diagnosis: healthy" in page.read_text()
 
@@ -71,13 +66,13 @@ def test_the_scale_of_the_noise_and_the_uncertainty_come_from_files(folder, tmp_
     loud = tmp_path / "loud.csv"
     y = inject(small(), u, noise="none")
     write(loud, u, y + 3 * (inject(small(), u, seed=9) - y))
-    refused = run(folder / "model.json", folder / "faulty.csv", "--healthy", loud)
+    refused = run("diagnose", folder / "model.json", folder / "faulty.csv", "--healthy", loud)
     assert refused.exit_code != 0 and "rescale" in refused.output
-    scaled = run(folder / "model.json", folder / "faulty.csv", "-k", "bias", "--healthy", loud, "--rescale")
+    scaled = run("diagnose", folder / "model.json", folder / "faulty.csv", "-k", "bias", "--healthy", loud, "--rescale")
     assert scaled.exit_code == 0, scaled.output
     origin = tmp_path / "origin.csv"
     write(origin, u, inject(small(), u, seed=9))
-    unsure = run(folder / "model.json", folder / "faulty.csv", "-k", "bias", "--identified", origin)
+    unsure = run("diagnose", folder / "model.json", folder / "faulty.csv", "-k", "bias", "--identified", origin)
     assert unsure.exit_code == 0 and "sensor:y2" in unsure.output, unsure.output
 
 
@@ -105,7 +100,7 @@ def test_bad_input_is_one_message(folder, tmp_path):
         ((model, faulty, "--out", tmp_path / "no" / "d.json"), "no folder"), ((model, faulty, faulty), "2 experiments"),
         ((model, faulty, "--picture", tmp_path / "d.xyz"), "xyz"), ((model, faulty, "--dt", "0.5"), "sampled every"),
     ):
-        result = run(*words)
+        result = run("diagnose", *words)
         said = " ".join(result.output.split())
         assert result.exit_code not in (0, None) and expected in said, (words, result.output)
         assert "Traceback" not in result.output and not isinstance(result.exception, KeyError | TypeError)

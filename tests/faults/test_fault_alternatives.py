@@ -190,8 +190,7 @@ def test_directions_by_outputs_move_the_outputs_so_in_any_coordinates():
         (LookupFailed, "no output 'y7'", lambda: direction_of(model, {"y7": 1.0})),
         (StructureError, "not zero", lambda: direction_of(model, {"y1": 0.0})),
         (StructureError, "nothing is left to judge", lambda: dictionary(model, disturbances=["sensor:y1", "u1"])),
-        (LookupFailed, "'wind'", lambda: dictionary(model, disturbances=["wind"])),
-    )
+        (LookupFailed, "'wind'", lambda: dictionary(model, disturbances=["wind"])))
 
 
 @pytest.mark.parametrize("name", ["actuator:u2", "sensor:y2", "process:load"])

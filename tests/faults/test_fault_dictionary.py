@@ -32,6 +32,7 @@ def difference(model, u, fault, gaps=0.0):
     ("process:load", Fault.step("process:load", ONSET, 0.4), [0.4]),
     ("actuator:u2 drift", Fault.ramp("actuator:u2", ONSET, 0.01), [0.01]),
     ("sensor:y1 drift", Fault.ramp("sensor:y1", ONSET, 0.01), [0.01]),
+    ("sensor:y1 spike", Fault.jump("sensor:y1", ONSET, 0.8), [0.8]),
     ("state", Fault.jump("state", ONSET, [1.0, -2.0, 0.5]), [1.0, -2.0, 0.5]),
     ("actuator:u1 loss", Fault.loss("actuator:u1", ONSET, 0.6), [0.6]),
     ("actuator:u1 stuck", Fault.stuck("actuator:u1", ONSET, 0.3), [1.0, 0.3]),
@@ -39,7 +40,7 @@ def difference(model, u, fault, gaps=0.0):
 ], ids=str)
 def test_a_signature_is_the_difference_the_fault_makes(label, fault, size, gaps):
     model, u = small(), levels(N, 2)
-    found = dictionary(model, process={"load": LOAD}, kinds=["bias", "drift", "loss", "stuck"])
+    found = dictionary(model, process={"load": LOAD}, kinds=["bias", "drift", "loss", "stuck", "spike"])
     change, present = difference(model, u, fault, gaps)
     signature = found.signature(label, N, ONSET, u=u, present=present)
     assert signature.shape == (N, 2, found[label].dimension)
@@ -58,8 +59,7 @@ def test_an_input_with_several_functions_has_one_share_lost_and_one_constant_for
 
 def test_the_trap_of_the_standard_plant(real_data):
     model, load = standard(real_data)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         found = dictionary(model, process={"load": load})
     assert found.labels == ("actuator:u1", "actuator:u2", "sensor:y1", "sensor:y2", "process:load", "state")
     (first, second, sine), = found.near
@@ -124,5 +124,4 @@ def test_choices_and_bad_input():
         (LookupFailed, "u7", lambda: dictionary(model, actuators=["u7"])),
         (LookupFailed, "z", lambda: dictionary(model, sensors="z")),
         (StructureError, "direction", lambda: dictionary(model, process={"load": [1.0]})),
-        (StructureError, "noise covariances", lambda: dictionary(replace(model, noise=None))),
-    )
+        (StructureError, "noise covariances", lambda: dictionary(replace(model, noise=None))))

@@ -103,8 +103,7 @@ def test_broken_sensors():
     close(model, u, Fault.loss("sensor:y2", 20, 0.4, bias=0.1), gain=gain, to_y=shift)
     gain[20:, 1] = 0.0
     close(model, u, Fault.hard_over("sensor:y2", 20), gain=gain)
-    close(model, u, Fault.stuck("sensor:y1", 20, 5.0),
-          reading=lambda k, y, ys: np.array([5.0, y[1]]) if k >= 20 else y)
+    close(model, u, Fault.stuck("sensor:y1", 20, 5.0), reading=lambda k, y, ys: np.array([5.0, y[1]]) if k >= 20 else y)
     close(model, u, Fault.frozen("sensor:y1", 20),
           reading=lambda k, y, ys: np.array([ys[-1][0], y[1]]) if k >= 20 else y)
     noisy_record = inject(model, u, Fault.frozen("sensor:y1", 20, end=40))

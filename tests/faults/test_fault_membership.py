@@ -171,7 +171,7 @@ def test_outputs_that_are_fed_back(found, missing):
     assert agreeing(model, Data(u, y), 1.5).window.steps.all() == (not missing)
 
 
-def test_states_without_noise_are_equations(found):
+def test_states_without_noise_are_equations():
     model = noisy([[0.8, 0.1], [0.0, 0.5]], [[1.0], [0.0]], [[1.0, 0.0], [0.0, 1.0]], np.diag([0.01, 0.04]),
                   0.01 * np.eye(2))
     u = levels(N, 1, m=1)
@@ -230,5 +230,4 @@ def test_bad_input(found):
         (StructureError, "no noise covariances", replace(model, noise=None), data, {}),
         *((StructureError, "onsets", model, data, {"faults": found, "onsets": k}) for k in ("some", [], [N], [-1])),
         (DataError, "one at a time", model, several, {}),
-        (DataError, "'u2' is missing at sample 3", model, Data(broken, data.y), {}),
-    )))
+        (DataError, "'u2' is missing at sample 3", model, Data(broken, data.y), {}))))

@@ -101,5 +101,4 @@ def test_bad_input(found):
         *((StructureError, "onset=", lambda k=k: test(onset=k)) for k in (-1, N, 2.5)),
         (DataError, "'y1' at sample 5", lambda: test(bad)),
         (StructureError, "one experiment|one by one", lambda: test((w, w))),
-        (LookupFailed, "was not tested", lambda: test()["sensor:y3"]),
-    )
+        (LookupFailed, "was not tested", lambda: test()["sensor:y3"]))

@@ -53,7 +53,7 @@ def test_own_solver_agrees_with_clarabel_and_the_conditions_hold(found, prior):
     stated = course_of_changes(problem, prior)
     own, other = (solve(stated, solver, accuracy=1e-9) for solver in ("block_descent", "clarabel"))
     assert own.proof and other.proof and other.objective == pytest.approx(own.objective, rel=1e-6)
-    columns = problem.matrix @ problem.shapes(prior)
+    columns = problem.matrix @ problem.shapes[prior]
     penalty = stated.weights["lambda"]
     slopes = columns.T @ (problem.r - columns @ own.values["changes"][:, 0])
     assert np.all(np.abs(slopes) <= penalty * (1 + 1e-4))
@@ -91,7 +91,7 @@ def test_the_refit_under_a_sign_is_non_negative_least_squares(found):
     held = profile(s, "sensor:y1", "tv", constraints=[lambda v: {"rising": v["changes"] >= 0}])
     problem = course_problem(s, "sensor:y1")
     kept = sorted(held.changes)
-    columns = (problem.matrix @ problem.shapes("tv"))[:, kept]
+    columns = (problem.matrix @ problem.shapes["tv"])[:, kept]
     np.testing.assert_allclose([held.changes[k] for k in kept], nnls(columns, problem.r)[0], atol=1e-6)
 
 
@@ -103,7 +103,7 @@ def test_a_healthy_window_has_no_course(found):
 
 def test_moving_ends_where_no_single_move_gains(found):
     problem = course_problem(search(found, Fault.step("sensor:y1", 20, 1.5, end=40)), "sensor:y1")
-    columns = problem.matrix @ problem.shapes("tv")
+    columns = problem.matrix @ problem.shapes["tv"]
     start = np.array([14, 46])
     kept = problem.move_changes(columns, start)
     energy = problem.refit(columns[:, kept])[1]
@@ -145,5 +145,4 @@ def test_bad_input(found):
         (StructureError, "several magnitudes", s, "actuator:u1 stuck", {}),
         (StructureError, "noise has no course", s, "sensor:y1 noise", {}),
         (StructureError, "depends on the input", without, "actuator:u1 loss", {}),
-        (DataError, "untestable", still, "actuator:u2 loss", {}),
-    )))
+        (DataError, "untestable", still, "actuator:u2 loss", {}))))

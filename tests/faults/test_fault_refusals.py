@@ -4,11 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from commands import run
 from fault_plants import levels
 from test_fault_injection import small
-from typer.testing import CliRunner
 
-from optid.cli.app import app
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults import Fault, diagnose, dictionary, inject, reformulate
@@ -21,7 +20,7 @@ def test_a_model_file_with_negative_variances_is_damaged(name, tmp_path):
     content = json.loads(path.read_text())
     content["noise"][name][0][0] = -1.0
     path.write_text(json.dumps(content))
-    result = CliRunner().invoke(app, ["isolability", str(path)])
+    result = run("isolability", path)
     assert result.exit_code == 2 and "negative variance" in result.output and "damaged" in result.output
 
 

@@ -125,5 +125,4 @@ def test_refusals(found):
         (LookupFailed, "as many directions as outputs", lambda: waveform_test(found, white)["state"]),
         (LookupFailed, "was not tested", lambda: waveform_test(found, white)["sensor:y7"]),
         (DataError, "longer window",
-         lambda: waveform_test(found, whiten(found.model, record(found.model, 0, count=3), x0="zero"))),
-    )
+         lambda: waveform_test(found, whiten(found.model, record(found.model, 0, count=3), x0="zero"))))

@@ -100,8 +100,7 @@ def test_bad_input():
     refused(
         (StructureError, "noise covariances", lambda: whiten(replace(model, noise=None), Data(u, np.zeros((60, 2))))),
         (DataError, "too few", lambda: health(whiten(model, Data(u[:15], inject(model, u[:15]))))),
-        (DataError, "determine", lambda: model_uncertainty(model, Data(u[:10], inject(model, u[:10])))),
-    )
+        (DataError, "determine", lambda: model_uncertainty(model, Data(u[:10], inject(model, u[:10])))))
 
 
 # -- the uncertainty of an identified model ----------------------------------------------------------------------------
@@ -132,8 +131,7 @@ def test_model_errors_count_as_noise(real_data):
         wrong = drawn(identified, seed)
         data = Data(u, inject(model, u, seed=seed + 100))
         own = replace(identified, model=wrong)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
+        with warnings.catch_warnings(action="ignore", category=DataWarning):
             naive.append(np.sum(whiten_with(wrong, data, identified).r ** 2))
             aware.append(np.sum(whiten_with(wrong, data, identified, own).r ** 2))
     root = identified.predictor.root  # in units of the size that this short record shows

@@ -333,5 +333,4 @@ def test_bad_input_is_refused_by_name():
         (RankError, "No experiment has the 5000 samples", data, healthy, dict(window=5000)),
         (DataError, "must be the same", Data(data.u, data.y, outputs=("a", "b")), healthy, {}),
         (RankError, "u2 is constant", data, Data(still, healthy.y), {}),
-        (RankError, "do not excite", data, Data(sines, healthy.y), {}),
-    )))
+        (RankError, "do not excite", data, Data(sines, healthy.y), {}))))

@@ -2,17 +2,15 @@
 
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run
 from fault_plants import LOAD, levels, noisy, refused, standard
 from scipy.stats import chi2, ncx2
 from test_fault_injection import small
-from typer.testing import CliRunner
 
 from optid import Data
-from optid.cli.app import app
 from optid.errors import DataError, LookupFailed, StructureError
 from optid.faults import Fault, dictionary, inject, isolability, whiten
 from optid.faults.false_alarms import family_thresholds
@@ -92,10 +90,10 @@ def test_the_standard_plant_needs_the_deflections_measured_before(standard_study
 def compared(study, faults, label, size, window, process=None, u=None, make=Fault.step):
     """Errors of the forecast of isolation and of detection, from 400 records: faults injected, whitened, searched."""
     rng, model, windows, c = np.random.default_rng(3), faults.model, [], study.labels.index(label)
-    for run in range(400):
-        driven = levels(100 + window, run) if u is None else u
+    for seed in range(400):
+        driven = levels(100 + window, seed) if u is None else u
         onset = 100 + int(rng.integers(window * MIDDLE[0], window * MIDDLE[1]))
-        y = inject(model, driven, make(faults[label].name, onset, size), seed=run, process=process)
+        y = inject(model, driven, make(faults[label].name, onset, size), seed=seed, process=process)
         windows.append(whiten(model, Data(driven, y), x0="zero").r[100:])
     there = [name in study.labels for name in faults.labels]
     energies = sweep(faults, window, None if u is None else u[100:]).largest(np.array(windows))[:, there]
@@ -123,8 +121,7 @@ def test_a_longer_window_helps_a_lasting_fault_and_not_a_transient_one(found):
 
 def test_faults_that_no_record_tells_apart_are_one_row():
     model = small(D=[[0.0, 0.0], [0.0, 0.3]])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         merged = dictionary(model, process={"same": model.B[:, 0]})
     study = isolability(merged, 40, calibration=5000, draws=300)
     assert study.ambiguity_groups == [("actuator:u1", "process:same")]
@@ -165,8 +162,7 @@ def test_bad_input(found):
         (StructureError, "No candidate has a signature",
          lambda: isolability(dictionary(small(), kinds="loss", state_jump=False), 40)),
         (LookupFailed, "sensor:y2",
-         lambda: isolability(found, 20, calibration=5000, draws=50).forecast("sensor:y", 1.0)),
-    )
+         lambda: isolability(found, 20, calibration=5000, draws=50).forecast("sensor:y", 1.0)))
 
 
 # -- faults whose signature depends on the input -----------------------------------------------------------------------
@@ -192,10 +188,6 @@ def test_an_actuator_that_does_not_move_is_untestable_and_more_than_all_cannot_b
         isolability(lossy, 40, u=u[:30])
 
 
-def run(*words):
-    return CliRunner().invoke(app, ["isolability", *map(str, words)])
-
-
 def test_the_page_has_a_row_for_every_fault_and_the_printed_matrix(tmp_path):
     found = isolability(dictionary(small()), 40, calibration=5000, draws=100)
     page = found.report(tmp_path / "page.html", command="optid isolability model.json").read_text(encoding="utf-8")
@@ -208,13 +200,13 @@ def test_the_page_has_a_row_for_every_fault_and_the_printed_matrix(tmp_path):
 def test_command(tmp_path):
     model = small()
     model.save(tmp_path / "model.json")
-    done = run(tmp_path / "model.json", "--window", 40, "--load", "pump=0.3,-0.2,0.5", "--draws", 200, "--picture",
-               tmp_path / "p.png", "--report", tmp_path / "p.html", "--kinds", "bias", "drift")
+    done = run("isolability", tmp_path / "model.json", "--window", 40, "--load", "pump=0.3,-0.2,0.5", "--draws", 200,
+               "--picture", tmp_path / "p.png", "--report", tmp_path / "p.html", "--kinds", "bias", "drift")
     assert done.exit_code == 0, done.output
     assert "process:pump drift" in done.output and "window 40 samples" in done.output
     assert all((tmp_path / f"p.{ending}").stat().st_size > 10_000 for ending in ("png", "html"))
     replace(model, noise=None).save(tmp_path / "silent.json")
     for words, message in ((["silent.json"], "noise covariances"), (["model.json", "--load", "pump"], "NAME="),
                            (["model.json", "--onset", "soon"], "--onset"), (["none.json"], "none.json")):
-        done = run(Path(tmp_path) / words[0], *words[1:])
+        done = run("isolability", tmp_path / words[0], *words[1:])
         assert done.exit_code != 0 and message in str(done.output) + str(done.exception)

@@ -18,8 +18,7 @@ def watch(real_data):
     """What the three tanks teach from two healthy runs: candidates, thresholds, uncertainty, and all runs."""
     stored = tanks.runs(real_data)
     own = tanks.record(*stored["normal"][:2])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # five steps are no optimum; faults that look alike
+    with warnings.catch_warnings(action="ignore", category=DataWarning):  # no optimum; faults alike
         model = tanks.fitted(own, block_rows=4, iterations=5)
         found = tanks.possible(model)
     monitor = Monitor(model, found, arl0=tanks.ARL0, window=tanks.WINDOW, samples=40_000, extrapolate=True)

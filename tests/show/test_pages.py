@@ -47,8 +47,7 @@ def pages(tmp_path_factory):
             folder / "comparison.html"),
         "order": optid.order(record).report(folder / "order.html"),
         "dated": report.write(dated_fit(), folder / "dated.html"),
-        "search": optid.identify(record, effort=3, workers=1).report(folder / "search.html"),
-    }
+        "search": optid.identify(record, effort=3, workers=1).report(folder / "search.html")}
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +156,7 @@ def test_the_theme_is_switched_by_a_button(pages, browser):
     assert browser.run("getComputedStyle(document.body).backgroundColor") != light
 
 
-def test_a_notebook_shows_at_most_one_screen(pages, browser, tmp_path):
+def test_a_notebook_shows_at_most_one_screen(browser, tmp_path):
     fit = example_fit("thruster")
     horizons = optid.fit_by_horizon(fit.model, fit.data)
     shown_results = {"fit": fit, "several": mimo_fit(), "validation": fit.validate(), "parameters": fit.params,

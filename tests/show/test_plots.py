@@ -39,8 +39,7 @@ def test_every_figure_is_drawn_without_a_warning_and_leaves_no_trace(make, name,
 def test_pyplot_is_never_imported():
     code = (
         "import sys, optid; from sample_fits import linear_fit; optid.plots.overview(linear_fit());"
-        "print('matplotlib.pyplot' in sys.modules)"
-    )
+        "print('matplotlib.pyplot' in sys.modules)")
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
                            cwd="tests/helpers")
     assert found.stdout.strip() == "False"

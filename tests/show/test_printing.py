@@ -42,8 +42,7 @@ def test_parameters_are_those_of_the_model_to_the_digits_of_their_errors():
     a, b = fit.model.a, fit.model.b
     expected = {
         "a1": a[0], "a2": a[1], "b0[valve]": b[0][0], "b1[valve]": b[0][1], "b0[heater]": b[1][0],
-        "b1[heater]": b[1][1], "offset": fit.model.offset[0],
-    }
+        "b1[heater]": b[1][1], "offset": fit.model.offset[0]}
     assert list(table) == list(expected)
     for name, value in expected.items():
         estimate, error, low, high = map(float, table[name])
@@ -109,8 +108,7 @@ def test_a_fit_without_a_point_is_described():
     data = example_fit("dead_zone").data
     fit = optid.fit(
         data, na=2, nb=2, basis="triangular:8", raises=False,
-        constraints=[lambda v: {"low": v["a"][0] <= -1}, lambda v: {"high": v["a"][0] >= 1}],
-    )
+        constraints=[lambda v: {"low": v["a"][0] <= -1}, lambda v: {"high": v["a"][0] >= 1}])
     text = describe(fit)
     assert fit.model is None and "No model: infeasible" in text and "Solution returned: no" in text
     assert max(map(len, text.splitlines())) <= 80
@@ -118,15 +116,13 @@ def test_a_fit_without_a_point_is_described():
 
 def test_validation_text_has_the_fit_that_the_formula_gives():
     fit = linear_fit()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optid.errors.DataWarning)  # too short for the structure test
+    with warnings.catch_warnings(action="ignore", category=optid.errors.DataWarning):  # of its length
         text = str(optid.validate(fit.model, fit.data))
     assert re.search(r"y, one step +100\.00", text)
 
 
 def test_no_line_of_a_validation_is_wider_than_80_columns():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optid.errors.DataWarning)
+    with warnings.catch_warnings(action="ignore", category=optid.errors.DataWarning):
         text = str(optid.validate(mimo_fit().model, two_by_two(seed=5), horizon=4))
     assert max(map(len, text.splitlines())) <= 80
     for words in ("level_a, 4 steps", "level_a, experiment 3", 'temp "b": independent of level_a', "white"):
@@ -158,8 +154,7 @@ def test_the_gauge_is_stated_and_true(gauge):
     said = {
         "norm": ("norm of b is one; the output rises with f", np.linalg.norm(b)),
         "gain": ("static gain of the linear part is one", b.sum() / (1 + fit.model.a.sum())),
-        "b0": ("first coefficient of b is one", b[0]),
-    }
+        "b0": ("first coefficient of b is one", b[0])}
     sentence, one = said[gauge]
     assert f"Gauge: {sentence}" in text and one == pytest.approx(1.0, abs=1e-9)
 

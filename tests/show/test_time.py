@@ -63,8 +63,7 @@ def before(text, verdict):
 def test_the_findings_of_the_record_come_before_every_verdict(clockless):
     assert clockless.findings == (FINDING,)
     fit = optid.fit(clockless, "arx", na=1, nb=2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         found = optid.identify(clockless, effort=2, workers=1, classes=["linear"])
     checked, compared = optid.validate(fit.model, clockless), optid.compare_models({"a": fit.model}, clockless)
     for text, verdict in ((str(fit), "The model on this record"), (str(checked), "Validation on"),

@@ -10,7 +10,7 @@ healthy plant within the bounds has produced the window.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,10 +18,8 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults.whitening import Predictor
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 SIGMAS = 3.0
 """Default bounds of the noise, in standard deviations."""
@@ -96,7 +94,6 @@ class ParityProof:
         return self.factor > 1.0
 
     def __str__(self) -> str:
-        """Return the parity sum, its limit and the factor."""
         total, most = abs(self.residual), self.limit
         return f"parity sum {total:.5g}, within the bounds at most {most:.5g}: factor {self.factor:.4f}"
 
@@ -144,7 +141,6 @@ class Membership:
         return None if self.proof is None else self.proof.weights
 
     def __str__(self) -> str:
-        """Print the factors and the proof."""
         verdict = "a healthy plant is impossible" if self.impossible else "a healthy plant is possible"
         lines = [f"bounds of the noise times {self.factor:.3f}: {verdict}"]
         lines += [f"  {self.proof}"[:80]] if self.proof is not None else [f"  no proof: {self.status}"[:80]]
@@ -156,7 +152,7 @@ class Membership:
         return "\n".join([*lines, *(f"  not tested: {label}, {why}"[:80] for label, why in self.untested.items())])
 
 
-def bounded_window(model: "HammersteinSS", data: Data, bounds: Any = SIGMAS) -> BoundedWindow:
+def bounded_window(model: HammersteinSS, data: Data, bounds: Any = SIGMAS) -> BoundedWindow:
     """Return a window with the bounds of its noise.
 
     Args:
@@ -221,7 +217,7 @@ def parity_proof(window: BoundedWindow, p: Array, unseen: Array) -> ParityProof:
     return ParityProof(p, q, residual, limit, rounding)
 
 
-def _bounds(model: "HammersteinSS", bounds: Any) -> tuple[Array, Array]:
+def _bounds(model: HammersteinSS, bounds: Any) -> tuple[Array, Array]:
     if isinstance(bounds, Mapping):
         if set(bounds) != {"process", "output"}:
             raise StructureError(f"bounds has {', '.join(map(repr, bounds))}; give 'process' and 'output'.")

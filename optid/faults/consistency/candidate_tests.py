@@ -114,12 +114,10 @@ def prove_factor(window: BoundedWindow, signature: Signature | None, weights: Ar
     Args:
         window: the window.
         signature: the additions of unknown sizes.
-        weights: multipliers of the noise in the states, (N - 1) n, then in the outputs, N l; empty where there is none.
+        weights: multipliers of the noise in the states, (N - 1) n, then in the outputs, N l.
         problem: the problem of the window.
         values: its solution.
     """
-    if not weights.size:
-        return Bound.none("the solver gave no multipliers")
     p = weights[(window.count - 1) * window.A.shape[0] :].reshape(window.e.shape)
     proof = parity_proof(window, p, window.unseen(*(signature or (None, None))))
     gap = relative_gap(problem.value(values), proof.factor, problem.scale)

@@ -70,7 +70,7 @@ class CourseFits:
 
     def keep_changes(self, prior: str, word: str, solution: Solution) -> Changes | None:
         """Return the changes of a solution that the criterion keeps; None where there is none that is new."""
-        problem, design = self.problem, self.problem.design(prior)
+        problem, design = self.problem, self.problem.design[prior]
         if not self.usable(word, solution, proved=False):
             return None
         lengths = np.linalg.norm(design, axis=0)
@@ -83,7 +83,7 @@ class CourseFits:
             return None
         self._seen.add(key)
         unit = 1 / np.where(lengths[kept] > 0, lengths[kept], 1.0)
-        return Changes(prior, kept, unit, design[:, kept] * unit, problem.shapes(prior)[:, kept] * unit)
+        return Changes(prior, kept, unit, design[:, kept] * unit, problem.shapes[prior][:, kept] * unit)
 
     def changing(self, changes: Changes, solution: Solution, names: tuple[str, ...]) -> None:
         """Add the course of changes, its heights those of a solution in `Changes.unit`, constraints by name."""

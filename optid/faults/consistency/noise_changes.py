@@ -168,7 +168,6 @@ class NoiseTest:
         raise LookupFailed(f"{name!r} was not tested. {nearest(name, [c.label for c in self.changes])}")
 
     def __str__(self) -> str:
-        """Print the places."""
         lines = [f"more noise from sample {self.onset} on: p-value {p_value(self.p_value, 3)} "
                  f"({self.draws} simulated windows)",
                  f"  {'place':<36}{'std added':>11}{'scale':>8}{'nats':>9}"]
@@ -242,8 +241,7 @@ def noise_test(
     changes = [
         NoiseChange(place.label, place.name, float(variance), place.interval(clean, float(variance), float(gain)),
                     float(gain), float(np.sqrt(1 + variance / place.present)) if place.present > 0 else float("nan"))
-        for place, variance, gain in zip(prepared.places, rho[0], gains[0])
-    ]
+        for place, variance, gain in zip(prepared.places, rho[0], gains[0])]
     changes.sort(key=lambda change: -change.gain)
     above = levels.size - int(np.searchsorted(levels, gains.max(), side="left"))
     return NoiseTest(tuple(changes), (1 + above) / (1 + levels.size), false_alarm, levels.size, onset)

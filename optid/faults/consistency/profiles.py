@@ -3,25 +3,17 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.waveforms import waveform_matrix
-from optid.faults.search.scanning import ALIKE
+from optid.faults.search.scanning import ALIKE, Scan
 from optid.faults.search.subsets import exchange_search
 from optid.faults.signatures import Candidate
 
-if TYPE_CHECKING:
-    from optid.faults.search.scanning import Scan
-
-PRIORS = {
-    "tv": "steps: constant between changes",
-    "trend": "ramps: straight between bends",
-    "smooth": "a random walk",
-}
+PRIORS = {"tv": "steps: constant between changes", "trend": "ramps: straight between bends", "smooth": "a random walk"}
 """Priors of the course."""
 
 EACH = 2
@@ -62,7 +54,6 @@ class Profile:
     status: str = ""
 
     def __str__(self) -> str:
-        """Print the changes and how the prior was chosen."""
         values = ", ".join(f"{prior} {value:.1f}" for prior, value in self.bic.items())
         lines = [f"course of {self.label[:60]}: {PRIORS[self.prior]}",
                  f"  BIC {values}; {self.freedom:.3g} degrees of freedom; largest gap {self.gap:.1e}"]
@@ -89,21 +80,15 @@ class CourseProblem:
         return self.matrix.shape[1]
 
     @cached_property
-    def _made(self) -> dict[tuple[str, str], Array]:
-        return {}
+    def shapes(self) -> dict[str, Array]:
+        """The courses (N, N) of a unit change at every sample, by the prior: steps, or ramps over the window."""
+        steps = np.tril(np.ones((self.count, self.count)))
+        return {"tv": steps, "trend": np.cumsum(steps, axis=0) / self.count}
 
-    def shapes(self, prior: str) -> Array:
-        """Return the courses (N, N) of a unit change at every sample: steps, or ramps over the window."""
-        if (prior, "shapes") not in self._made:
-            steps = np.tril(np.ones((self.count, self.count)))
-            self._made[prior, "shapes"] = steps if prior == "tv" else steps @ steps / self.count
-        return self._made[prior, "shapes"]
-
-    def design(self, prior: str) -> Array:
-        """Return the effects (N l, N) of these on the window."""
-        if (prior, "design") not in self._made:
-            self._made[prior, "design"] = self.matrix @ self.shapes(prior)
-        return self._made[prior, "design"]
+    @cached_property
+    def design(self) -> dict[str, Array]:
+        """The effects (N l, N) of these on the window."""
+        return {prior: self.matrix @ courses for prior, courses in self.shapes.items()}
 
     @property
     def differences(self) -> Array:
@@ -163,7 +148,7 @@ class CourseProblem:
         return np.unique([k for _, k in found]).astype(int)
 
 
-def course_problem(found: "Scan", label: str) -> CourseProblem:
+def course_problem(found: Scan, label: str) -> CourseProblem:
     """Return the regression of the course of one candidate with one magnitude, from the search of the window.
 
     Raises:

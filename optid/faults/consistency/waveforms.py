@@ -89,7 +89,6 @@ class WaveformTest:
         raise LookupFailed(f"{name!r} was not tested. {nearest(name, [place.name for place in self.places])}")
 
     def __str__(self) -> str:
-        """Print the places and which are consistent."""
         lines = [f"a fault of any course from sample {self.onset} on; set with probability {self.probability:g}",
                  f"  {'place':<34}{'energy left':>12}{'limit':>9}{'p-value':>10}"]
         for place in (*self.places, self.healthy):
@@ -100,7 +99,7 @@ class WaveformTest:
 
 
 def waveform_test(
-    found: Dictionary, whitened: Whitened, probability: float = 0.99, *, onset: int = 0, free_start: bool = True,
+    found: Dictionary, whitened: Whitened, probability: float = 0.99, *, onset: int = 0,
     data: Data | None = None,
 ) -> WaveformTest:
     """Test every place of a dictionary for a fault of any course.
@@ -112,7 +111,6 @@ def waveform_test(
         whitened: the window; one experiment.
         probability: with which the set is to contain the true place.
         onset: first sample that the fault can change; a later one makes the test more powerful.
-        free_start: whether the initial state of the window is unknown (as when it was fitted to the window).
         data: the record of the window, for the flat-line test of frozen sensors.
 
     Raises:
@@ -125,7 +123,7 @@ def waveform_test(
         raise StructureError(
             "Not isolable with one output: a fault of any course in any place explains it. Faults of a known course "
             "(bias, drift, loss) are isolable by the exact search.")
-    start = start_matrix(whitened) if free_start else np.zeros((whitened.r.size, 0))
+    start = start_matrix(whitened)
     tested, untested = [], {}
     for candidate in found.candidates:
         if candidate.fault_kind.without_course:

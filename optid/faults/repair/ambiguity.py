@@ -8,20 +8,18 @@ in the whitened innovations.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import StructureError
+from optid.faults.diagnosis.answers import FaultAnswer
 from optid.faults.repair.allocation import Allocation, input_bounds
 from optid.faults.repair.damage import Damage, damages
 from optid.faults.whitening import predictor
-
-if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import FaultAnswer
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 APART = 4.0
 """Distance of two explanations in the whitened innovations at which one is rejected nearly always."""
@@ -47,11 +45,9 @@ class Probe:
     pair: tuple[str, str]  # the two members with the smallest distance
 
     def __str__(self) -> str:
-        """Return the length, the separation and its bound."""
         return (
             f"probe of {len(self.u)} samples: {self.pair[0]} and {self.pair[1]} differ by {self.separation:.3g} "
-            f"standard deviations\n  (random levels {self.ordinary:.3g}; at most {self.bound:.3g} possible)"
-        )
+            f"standard deviations\n  (random levels {self.ordinary:.3g}; at most {self.bound:.3g} possible)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +63,13 @@ class Ambiguity:
     probe: Probe | None = field(repr=False)  # an input that isolates them; None where no input does
 
     def __str__(self) -> str:
-        """Return the members, the action and its reason."""
         members = ", ".join(f"{label} ({100 * p:.0f} %)" for label, p in zip(self.labels, self.posteriors))
         lines = [f"{len(self.labels)} explanations are left: {members}", f"  advice: {self.action}; {self.reason}"]
         return "\n".join(lines + [f"  {line}" for line in str(self.probe or "").splitlines()])
 
 
 def probe_input(
-    model: Any, members: Sequence["Damage | FaultAnswer"], *, length: int = 20, hold: int = 5,
+    model: Any, members: Sequence[Damage | FaultAnswer], *, length: int = 20, hold: int = 5,
     low: ArrayLike | None = None,
     high: ArrayLike | None = None, seed: int = 0,
 ) -> Probe:
@@ -144,7 +139,7 @@ def probe_input(
     return Probe(course(best), reached, ordinary, bound, (broken[i].label, broken[j].label))
 
 
-def _responses(model: "HammersteinSS", members: Sequence[Damage], length: int) -> list[tuple[Array, Array]]:
+def _responses(model: HammersteinSS, members: Sequence[Damage], length: int) -> list[tuple[Array, Array]]:
     """Signature of each member in the whitened innovations: M v + d, M (length l, length r), d (length l,)."""
     steady, (n, r), l = predictor(model), model.B.shape, model.l  # noqa: E741
     x, y = np.zeros((length, n, r)), np.zeros((length, l, r))
@@ -163,20 +158,22 @@ def _responses(model: "HammersteinSS", members: Sequence[Damage], length: int) -
 
 
 def advise(
-    model: "HammersteinSS", members: Sequence[Damage], u: Array | None, robust: Allocation | None, why_not: str,
-    *, action: str = "auto", seed: int = 0,
+    model: HammersteinSS, members: Sequence[Damage], u: Array | None, control: Allocation | str, bounds: Any, *,
+    action: str = "auto", seed: int = 0,
 ) -> Ambiguity:
     """Return advice: "wait", "probe" or "robust", or the better one ("auto").
 
-    The wait follows from recent inputs u (N, m); `why_not` is the reason where there is no robust control.
+    The wait follows from recent inputs u (N, m); `control` is the robust one, or the reason why there is none; `bounds`
+    are the least and largest inputs.
 
     Raises:
         StructureError: an action that is not possible.
     """
-    wait = _waiting(model, members, u)
+    wait, (low, high) = _waiting(model, members, u), bounds
+    robust, why_not = (None, control) if isinstance(control, str) else (control, "")
     probe, no_probe = None, ""
     try:
-        probe = probe_input(model, members, seed=seed)
+        probe = probe_input(model, members, low=low, high=high, seed=seed)
     except StructureError as error:
         no_probe = str(error)
     if action == "probe" and probe is None or action == "robust" and robust is None:
@@ -197,7 +194,7 @@ def advise(
                      robust, probe)
 
 
-def _waiting(model: "HammersteinSS", members: Sequence[Damage], u: Array | None) -> float:
+def _waiting(model: HammersteinSS, members: Sequence[Damage], u: Array | None) -> float:
     """Samples until the ordinary input isolates one of the closest pair."""
     plain = all(np.all(one.gains == 1) and not one.constants.any() and not one.added.any() for one in members)
     if plain and len({one.sensors for one in members}) > 1:

@@ -1,7 +1,7 @@
 """A damaged nonlinearity: the nodes of its values, the samples that support each, and the estimate."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +9,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.bases import Triangular
 from optid.data.record import Data
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,16 +51,14 @@ class Curve:
         return self.visited < 0.5
 
     def __str__(self) -> str:
-        """Print the values as a table."""
         head = f"  {'u':>9}{'before':>12}{'now':>12}{'+-':>10}"
         rows = [
             f"  {u:>9.3g}{old:>12.4g}{new:>12.4g}{std:>10.2g}{'  prior only' if unseen else ''}"
-            for u, old, new, std, unseen in zip(self.nodes, self.healthy, self.values, self.std, self.prior_only)
-        ]
+            for u, old, new, std, unseen in zip(self.nodes, self.healthy, self.values, self.std, self.prior_only)]
         return "\n".join([f"f of {self.name}", head, *rows])
 
 
-def curve_of(model: "HammersteinSS", column: int, inputs: Array, raw: Data, nodes: int, dead: bool) -> Curve:
+def curve_of(model: HammersteinSS, column: int, inputs: Array, raw: Data, nodes: int, dead: bool) -> Curve:
     """Return a damaged nonlinearity at the nodes of its own triangular basis, or at even nodes over its range.
 
     The inputs (N, m) are those after the fault; the range of the whole record is used where the basis has none.

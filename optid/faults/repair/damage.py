@@ -3,19 +3,17 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.bases import Triangular
+from optid.faults.diagnosis.answers import Estimate, FaultAnswer
 from optid.faults.places import channel_of
 from optid.faults.signatures import Candidate
+from optid.models import HammersteinSS
 from optid.models.nonlinearity import Nonlinearity
-
-if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import Estimate, FaultAnswer
-    from optid.models import HammersteinSS
 
 DEAD_SHARE = 0.8
 """An actuator whose interval of the share lost holds one counts as dead from this estimate on."""
@@ -45,7 +43,7 @@ class Damage:
         """Whether parameters of the plant itself are to be estimated."""
         return bool(self.columns or self.offsets)
 
-    def with_noise(self, model: "HammersteinSS") -> "HammersteinSS":
+    def with_noise(self, model: HammersteinSS) -> HammersteinSS:
         """Return a model with the added noise of the faults."""
         if model.noise is None or not (self.louder_sensors or self.louder_states.any()):
             return model
@@ -58,7 +56,7 @@ class Damage:
         steady = kalman_gain(model.A, model.C, Q, R, model.noise.S)
         return replace(model, K=steady.K, noise=replace(model.noise, Q=Q, R=R, innovation=steady.innovation))
 
-    def nominal_model(self, model: "HammersteinSS") -> "HammersteinSS":
+    def nominal_model(self, model: HammersteinSS) -> HammersteinSS:
         """Return the model with the gains and constants of the diagnosis, without a refit."""
         functions = list(model.nonlinearities)
         constants = np.array(self.constants)
@@ -72,25 +70,24 @@ class Damage:
                 functions[i] = replace(one, mu=self.gains[i] * one.mu, offset=offset)
         return replace(
             model, nonlinearities=tuple(functions), offset_x=model.offset_x + model.B @ constants + self.added,
-            offset_y=model.offset_y + model.D @ constants, gauge="none",
-        )
+            offset_y=model.offset_y + model.D @ constants, gauge="none")
 
 
-def damages(model: "HammersteinSS", answer: "FaultAnswer") -> list[Damage]:
+def damages(model: HammersteinSS, answer: FaultAnswer) -> list[Damage]:
     """Return one explanation of an answer, or one for each part of a group that is not isolable."""
     parts = [[(place, fault) for place in fault.candidate.places or (fault.name,)] for fault in answer.faults]
     variants = list(product(*parts))
     return [_damage(model, parts, answer.posterior / len(variants)) for parts in variants]
 
 
-def _may_be_none(fault: "Estimate") -> bool:
+def _may_be_none(fault: Estimate) -> bool:
     """Whether no interval of the size of a fault that changes the plant excludes zero."""
     lasting = fault.candidate.fault_kind.lasting and not fault.name.startswith("sensor:")
     intervals = np.asarray(fault.size_interval, dtype=float)
     return lasting and intervals.size > 0 and bool(np.all((intervals[:, 0] <= 0) & (intervals[:, 1] >= 0)))
 
 
-def merge_equivalent(model: "HammersteinSS", broken: list[Damage]) -> list[Damage]:
+def merge_equivalent(model: HammersteinSS, broken: list[Damage]) -> list[Damage]:
     """Merge explanations that break the same parts, as a loss and a stuck actuator do, which are refitted alike.
 
     So are an actuator and a disturbance of the states where it enters. The most probable one is kept, with the sum of
@@ -120,7 +117,7 @@ def _covers(into: Array, other: Damage) -> bool:
                == np.linalg.matrix_rank(into, tol=1e-9) for c in other.offsets)
 
 
-def _damage(model: "HammersteinSS", parts: Sequence[tuple[str, "Estimate"]], posterior: float) -> Damage:
+def _damage(model: HammersteinSS, parts: Sequence[tuple[str, Estimate]], posterior: float) -> Damage:
     """Collect the damage of faults at some places."""
     r, n = len(model.nonlinearities), model.nx
     found: dict[str, list[Any]] = {"columns": [], "dead": [], "sensors": [], "offsets": [], "notes": []}

@@ -12,16 +12,14 @@ counts.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array, as_list
 from optid.data.record import Data
 from optid.errors import DataError
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
+from optid.models import HammersteinSS
 
 CONFIDENCE = 0.9
 """Of the bounds of all outputs together, and of the spread of the estimates."""
@@ -73,14 +71,13 @@ class Promise:
         return float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else float("nan")
 
     def __str__(self) -> str:
-        """State the bound for every output."""
         if np.isnan(self.bound).all():
             return "no error is promised: too few samples after the fault to try the repair on"
         told = ", ".join(f"{name} {value:.3g}" for name, value in zip(self.outputs, self.bound))
         return f"rms error of {'one-step predictions' if self.ahead else 'the simulation'} at most: {told}"
 
 
-def errors(model: "HammersteinSS", data: Data) -> Array:
+def errors(model: HammersteinSS, data: Data) -> Array:
     """Return the errors (N, l) of a model on a record, its initial states fitted; NaN where a reading is missing.
 
     They are infinite where its run leaves all bounds.

@@ -8,7 +8,7 @@ the other parameters.
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,16 +16,14 @@ from optid.arrays import Array
 from optid.bases import Linear
 from optid.data.record import Data
 from optid.data.stretches import interpolate_missing
-from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.errors import DataError, DataWarning, StructureError
 from optid.faults.repair.curves import Curve, curve_of
 from optid.faults.repair.damage import Damage
 from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor, predictor, whiten
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
 from optid.models.nonlinearity import Nonlinearity
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 NODES = 7
 """Values of a damaged nonlinearity that are estimated, where it has no nodes of its own."""
@@ -83,7 +81,7 @@ class RefitWindow(NamedTuple):
 class Refitting:
     """A record after a fault and the open parameters of the model."""
 
-    model: "HammersteinSS"  # the healthy model
+    model: HammersteinSS  # the healthy model
     steady: Predictor  # its predictor; its gain is kept
     windows: tuple[RefitWindow, ...]  # one per experiment
     curves: tuple[Curve, ...]  # the damaged nonlinearities
@@ -137,6 +135,22 @@ class Refitting:
     def samples(self) -> int:
         """Samples after the fault."""
         return int(sum(len(w.u) - int(w.held) for w in self.windows))
+
+    @property
+    def least(self) -> int:
+        """Samples with every output that as many readings take as there are values to estimate."""
+        return -(-self._open // self.model.l)
+
+    @property
+    def shortage(self) -> str:
+        """Why the record is too short for a refit; "" where it is not."""
+        return "" if self.readings >= self._open else (
+            f"{self.readings} readings after the fault, and {self._open} values to estimate: at least {self.least} "
+            "samples with every output are needed.")
+
+    @property
+    def _open(self) -> int:
+        return sum(curve.values_open for curve in self.curves) + sum(c.into_state.shape[1] for c in self.offsets)
 
     def unpack(self, theta: Array) -> dict[str, Array]:
         """Return the unknowns by name."""
@@ -219,7 +233,7 @@ class Refitting:
         found[np.ix_(free, free)] = np.linalg.pinv(rows[:, free].T @ rows[:, free], hermitian=True)
         return found[: self.start.size, : self.start.size]
 
-    def model_at(self, theta: Array) -> "HammersteinSS":
+    def model_at(self, theta: Array) -> HammersteinSS:
         """Return the model of a vector of unknowns; constants of damaged nonlinearities become its offsets."""
         values = self.unpack(theta)
         changes: dict[str, Any] = {name: values[name] for name in MATRICES if self.whole}
@@ -278,7 +292,7 @@ class Refitting:
 
 
 def refitting(
-    model: "HammersteinSS", data: Data, damage: Damage, *, whole: bool = False, prior: RefitPrior | None = None,
+    model: HammersteinSS, data: Data, damage: Damage, *, whole: bool = False, prior: RefitPrior | None = None,
     nodes: int = NODES,
 ) -> Refitting:
     """Prepare a refit from the record after a fault.
@@ -296,7 +310,6 @@ def refitting(
 
     Raises:
         DataError: a missing input after the fault, an onset beyond the record, other channels than the model's.
-        RankError: fewer readings than unknowns, with the least number of samples.
         StructureError: no noise covariances.
 
     Warns:
@@ -307,16 +320,10 @@ def refitting(
                     for number, part in enumerate(raw.experiments))
     inputs = np.vstack([w.u[int(w.held) :] for w in windows])
     curves = tuple(curve_of(model, i, inputs, raw, nodes, i in damage.dead) for i in damage.columns)
-    found = Refitting(model, steady, windows, curves, damage.offsets, whole, prior or RefitPrior())
-    needed = sum(curve.values_open for curve in curves) + sum(c.into_state.shape[1] for c in damage.offsets)
-    if found.readings < needed:
-        raise RankError(
-            f"{found.readings} readings after the fault, and {needed} values to estimate: at least "
-            f"{-(-needed // model.l)} samples with every output are needed.")
-    return found
+    return Refitting(model, steady, windows, curves, damage.offsets, whole, prior or RefitPrior())
 
 
-def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: int, known_start: bool) -> RefitWindow:
+def _cut(model: HammersteinSS, steady: Predictor, u: Array, y: Array, onset: int, known_start: bool) -> RefitWindow:
     """Cut a record at the onset of a fault; the state there is predicted from the samples before."""
     if onset >= len(y):
         raise DataError(f"The onset {onset} lies beyond the record of {len(y)} samples.")

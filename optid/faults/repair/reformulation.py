@@ -5,7 +5,7 @@ Everything here is a pure function of a healthy model and a diagnosis; the healt
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import check_integer
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
+from optid.faults.diagnosis.answers import Diagnosis
 from optid.faults.diagnosis.records import record_of
 from optid.faults.repair.allocation import Allocation, Target, allocate, robust_allocation
 from optid.faults.repair.ambiguity import Ambiguity, advise
@@ -20,11 +21,8 @@ from optid.faults.repair.damage import Damage, damages, merge_equivalent
 from optid.faults.repair.refitting import NODES, RefitPrior
 from optid.faults.repair.schedule import RefitRules, Schedule, refit
 from optid.faults.repair.virtual_sensor import Observer, observer, without_sensors
+from optid.models import HammersteinSS
 from optid.registry import Rendered
-
-if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import Diagnosis
-    from optid.models import HammersteinSS
 
 WITHOUT_ANSWER = {
     "unknown": "no fault of the dictionary fits, so that no part of the model can be changed. Add candidates to the "
@@ -42,7 +40,7 @@ class MemberModel:
     """The plant under one explanation."""
 
     damage: Damage  # the explanation
-    model: "HammersteinSS"  # the plant under it
+    model: HammersteinSS  # the plant under it
     observer: Observer  # filter on the remaining sensors
     allocation: Allocation | None  # control by the remaining actuators; None where `notes` say why
     schedule: Schedule | None  # how the model was refitted; None where the plant itself is unchanged
@@ -54,7 +52,6 @@ class MemberModel:
         return self.damage.label
 
     def __str__(self) -> str:
-        """Return the refit, the observer, the allocation and the notes."""
         parts = [one for one in (self.schedule, self.observer, self.allocation) if one is not None]
         return "\n".join([*map(str, parts), *(f"note: {note}" for note in self.notes)])
 
@@ -77,8 +74,8 @@ class Reformulation(Rendered):
     """
 
     status: str
-    healthy: "HammersteinSS"
-    model: "HammersteinSS"
+    healthy: HammersteinSS
+    model: HammersteinSS
     observer: Observer
     allocation: Allocation | None
     schedule: Schedule | None
@@ -108,7 +105,7 @@ class Reformulation(Rendered):
 
 
 def reformulate(
-    model: "HammersteinSS", diagnosis: "Diagnosis", data: Any = None, *,
+    model: HammersteinSS, diagnosis: Diagnosis, data: Any = None, *,
     constraints: Sequence[Any] | str = "default", prior: RefitPrior | None = None, nodes: int = NODES,
     stage: str = "auto",
     low: ArrayLike | None = None, high: ArrayLike | None = None, weights: ArrayLike | None = None,
@@ -156,7 +153,7 @@ def reformulate(
     rules = RefitRules(constraints, prior, nodes, stage, solver, seed)
     bounds: dict[str, Any] = {"low": low, "high": high, "weights": weights, "solver": solver}
 
-    def try_allocation(plant: "HammersteinSS") -> tuple[Allocation | None, list[str]]:
+    def try_allocation(plant: HammersteinSS) -> tuple[Allocation | None, list[str]]:
         """Return the allocation, or why there is none: inputs without an interval, when no bounds are given."""
         for f, c in zip(plant.nonlinearities, plant.input_of):
             if f.basis.interval is None and (low is None or high is None):
@@ -190,13 +187,13 @@ def reformulate(
     if len(distrusted) == model.l:
         distrusted = []
         notes = ["every sensor is suspected by some member: all are used until one member is left", *notes]
-    robust, why_not = None, ""
+    robust: Allocation | str
     try:
         robust = robust_allocation(model, broken, **bounds)
     except StructureError as error:
-        why_not = str(error)
+        robust = str(error)
     u = None if data is None else np.asarray(data.raw().experiments[0].u)
-    advice = advise(model, broken, u, robust, why_not, action=if_ambiguous, seed=seed)
+    advice = advise(model, broken, u, robust, (low, high), action=if_ambiguous, seed=seed)
     return Reformulation("ambiguous", model, model, observer(model, distrusted), allocation, None, tuple(members),
                          advice, tuple(notes))
 
@@ -205,16 +202,14 @@ def _check(model: Any, diagnosis: Any, stage: str, nodes: int, if_ambiguous: str
     if getattr(model, "kind", "") != "HammersteinSS":
         raise StructureError(
             f"A {getattr(model, 'title', type(model).__name__)} cannot be reformulated: a state-space model with noise "
-            "covariances is needed (formulation hammerstein_ss.asivid)."
-        )
+            "covariances is needed (formulation hammerstein_ss.asivid).")
     if isinstance(diagnosis, tuple | list):
         raise StructureError("Several diagnoses: reformulate takes one, of one experiment.")
     if not hasattr(diagnosis, "verdict"):
         raise StructureError(f"{type(diagnosis).__name__} is no diagnosis: pass the result of optid.faults.diagnose.")
     if diagnosis.outputs and tuple(diagnosis.outputs) != model.outputs:
         raise DataError(
-            f"The diagnosis is of outputs {', '.join(diagnosis.outputs)}; the model has {', '.join(model.outputs)}."
-        )
+            f"The diagnosis is of outputs {', '.join(diagnosis.outputs)}; the model has {', '.join(model.outputs)}.")
     if diagnosis.verdict != "healthy" and not diagnosis.candidates:
         why = WITHOUT_ANSWER.get(diagnosis.verdict, "it has no candidates")
         raise StructureError(f"The diagnosis is {diagnosis.verdict!r}: {why}.")

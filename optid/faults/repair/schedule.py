@@ -3,22 +3,20 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.errors import DataWarning, RankError
+from optid.errors import DataWarning
 from optid.faults.repair.curves import Curve
 from optid.faults.repair.damage import Damage
 from optid.faults.repair.promise import CONFIDENCE, Promise, errors, rms, upper_rms
 from optid.faults.repair.refitting import NODES, RefitPrior, Refitting, refitting
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
-    from optid.program.solution import Solution
+from optid.program.solution import Solution
 
 HELD_OUT = 0.3
 """Share of the samples after the fault that is held out."""
@@ -50,11 +48,10 @@ class Schedule:
     offsets: dict[str, Array]  # {fault: estimated size}
     promise: Promise | None  # what is known of its errors; None without a refit
     active: tuple[str, ...]  # constraints that bind
-    solution: "Solution | None" = field(default=None, repr=False)  # of the last programme; None without one
+    solution: Solution | None = field(default=None, repr=False)  # of the last programme; None without one
     reason: str = ""  # why this stage
 
     def __str__(self) -> str:
-        """Return the stage, the reason, the error promised and the values."""
         lines = [f"refit: {self.stage}, {self.samples} samples after the fault ({self.reason})"]
         if self.solution is not None:
             proof = f"gap {self.solution.gap:.1e}" if self.solution.proof else "no proof of global optimality"
@@ -82,8 +79,8 @@ class RefitRules:
     seed: int = 0
 
 
-def refit(model: "HammersteinSS", data: Data, damage: Damage, rules: RefitRules, healthy: Data | None = None
-          ) -> tuple["HammersteinSS", Schedule]:
+def refit(model: HammersteinSS, data: Data, damage: Damage, rules: RefitRules, healthy: Data | None = None
+          ) -> tuple[HammersteinSS, Schedule]:
     """Refit what a fault broke, or all parameters where that predicts held-out samples better.
 
     The model, the data and `healthy` are those of `reformulate`. A repair that is not offered leaves the model as it
@@ -92,17 +89,11 @@ def refit(model: "HammersteinSS", data: Data, damage: Damage, rules: RefitRules,
     Warns:
         DataWarning: too few samples for a refit, with the least number; part of the input range that no sample visits.
     """
-    nodes, stage = rules.nodes, rules.stage
-    try:
-        narrow = refitting(model, data, damage, prior=rules.prior, nodes=nodes)
-    except RankError as error:
-        warnings.warn(f"{damage.label}: no refit. {error}", DataWarning, stacklevel=3)
-        counted = sum(1 if i in damage.dead else nodes for i in damage.columns) + sum(
-            c.into_state.shape[1] for c in damage.offsets)
-        after = max(0, data.experiments[0].y.shape[0] - damage.onset)
-        none = Schedule("prior", after, -(-counted // model.l), {}, (), {}, None, (), None,
-                        "too few for a refit: the model is that of the diagnosis")
-        return damage.nominal_model(model), none
+    narrow, stage = refitting(model, data, damage, prior=rules.prior, nodes=rules.nodes), rules.stage
+    if narrow.shortage:
+        warnings.warn(f"{damage.label}: no refit. {narrow.shortage}", DataWarning, stacklevel=3)
+        return damage.nominal_model(model), Schedule("prior", narrow.samples, narrow.least, {}, (), {}, None, (), None,
+                                                     "too few for a refit: the model is that of the diagnosis")
     if rules.prior is None and narrow.curves:  # of the curvatures the one that makes the record most probable
         tried = [replace(narrow, prior=replace(narrow.prior, curvature=curvature)) for curvature in BENDS]
         narrow = max(tried, key=Refitting.evidence)
@@ -135,14 +126,12 @@ def refit(model: "HammersteinSS", data: Data, damage: Damage, rules: RefitRules,
             at = ", ".join(f"{u:.3g}" for u in one.nodes[one.prior_only])
             warnings.warn(
                 f"{one.name}: no sample after the fault lies near {at} (inputs from {one.seen[0]:.3g} to "
-                f"{one.seen[1]:.3g}): the values there are prior only.", DataWarning, stacklevel=3,
-            )
+                f"{one.seen[1]:.3g}): the values there are prior only.", DataWarning, stacklevel=3)
     offsets = {c.label: problem.unpack(theta)[f"size[{c.label}]"] for c in problem.offsets}
     model = _plant(problem, theta)
     duals, objective = found.solution.duals, max(found.solution.objective, 1e-300)
     active = tuple(name for name in found.problem.constraint_names
                    if np.max(np.abs(duals.get(name, 0.0)), initial=0.0) > 1e-6 * objective)
-    least = -(-sum(curve.values_open for curve in curves) // model.l)
     promised = None
     if narrow.samples >= FEWEST:
         trial = tried_on.get(stage) or _solved(problem.held_out(samples), rules)
@@ -150,8 +139,7 @@ def refit(model: "HammersteinSS", data: Data, damage: Damage, rules: RefitRules,
         ends, first = raw.select(experiments=raw.n_experiments - 1), raw.select(experiments=0)
         held = ends.window(ends.n_samples - samples, ends.n_samples)
         sound = first.window(0, damage.onset) if healthy is None and damage.onset >= FEWEST else healthy
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
+        with warnings.catch_warnings(action="ignore", category=DataWarning):
             repaired, unrepaired = errors(_plant(problem, trial.model.theta), held), errors(before, held)
             promised = Promise(
                 before.outputs, upper_rms(np.full((1, before.l), np.nan) if sound is None else errors(before, sound)),
@@ -159,12 +147,12 @@ def refit(model: "HammersteinSS", data: Data, damage: Damage, rules: RefitRules,
                 _spread(problem, theta, covariance, ends, rules.seed),
                 np.sqrt(np.diag(problem.steady.covariance)), not model.is_stable)
     refused = promised is not None and bool(promised.refusal)
-    schedule = Schedule("none" if refused else stage, problem.samples, least, scores, curves, offsets, promised, active,
-                        found.solution, reason)
+    schedule = Schedule("none" if refused else stage, problem.samples, problem.least, scores, curves, offsets, promised,
+                        active, found.solution, reason)
     return before if refused else model, schedule
 
 
-def _plant(problem: Refitting, theta: Array) -> "HammersteinSS":
+def _plant(problem: Refitting, theta: Array) -> HammersteinSS:
     """Return the model of a refit, with what the faults add at the end of the record."""
     model = problem.model_at(theta)
     for c in problem.offsets:

@@ -8,7 +8,7 @@ estimated from healthy data; the projection onto their signal subspace is the sa
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,11 +16,9 @@ from optid.arrays import Array, one_or_all
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults.places import channel_of
+from optid.models import HammersteinSS
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
-
-if TYPE_CHECKING:
-    from optid.models import HammersteinSS
 
 LAGS = 16
 """Samples of the past in a sensor that is learnt from data."""
@@ -43,7 +41,7 @@ class Observer:
         error: (n, n) covariance of the error of the corrected state.
     """
 
-    model: "HammersteinSS"
+    model: HammersteinSS
     lost: tuple[str, ...]
     correction: Array
     error: Array
@@ -82,7 +80,6 @@ class Observer:
         return one_or_all(found)
 
     def __str__(self) -> str:
-        """Return the lost sensors and the predicted error of each."""
         head = f"filter without {', '.join(self.lost)}" if self.lost else "filter on all sensors"
         rows = [f"  {name}: predicted RMSE {self.rmse[name]:.4g} (its own noise {self.noise[name]:.4g}, simulation "
                 f"{self.open_loop[name]:.4g})" for name in self.lost]
@@ -95,12 +92,12 @@ def without_sensors(data: Data, names: Sequence[str]) -> Data:
     return data.map_signals(lambda u: u, lambda y: np.where(gone, np.nan, y)) if gone.any() else data
 
 
-def _output_errors(model: "HammersteinSS", covariance: Array) -> dict[str, float]:
+def _output_errors(model: HammersteinSS, covariance: Array) -> dict[str, float]:
     squares = np.einsum("oi,ij,oj->o", model.C, covariance, model.C)
     return dict(zip(model.outputs, np.sqrt(np.maximum(squares, 0.0)).tolist()))
 
 
-def _uncorrected(model: "HammersteinSS") -> Array:
+def _uncorrected(model: HammersteinSS) -> Array:
     """Covariance (n, n) of the state of a stable plant."""
     from scipy.linalg import solve_discrete_lyapunov
 
@@ -108,7 +105,7 @@ def _uncorrected(model: "HammersteinSS") -> Array:
     return np.asarray(solve_discrete_lyapunov(model.A, model.noise.Q))
 
 
-def observer(model: "HammersteinSS", lost: Sequence[str] = ()) -> Observer:
+def observer(model: HammersteinSS, lost: Sequence[str] = ()) -> Observer:
     """Return the Kalman filter on the sensors of a model that are not lost ("y1" or "sensor:y1").
 
     Raises:
@@ -139,7 +136,7 @@ def observer(model: "HammersteinSS", lost: Sequence[str] = ()) -> Observer:
     return Observer(replace(model, K=K), names, correction, (error + error.T) / 2)
 
 
-def check_stabilisable(model: "HammersteinSS", left: Sequence[int]) -> None:
+def check_stabilisable(model: HammersteinSS, left: Sequence[int]) -> None:
     """Refuse a mode that does not decay and that no remaining function of the inputs controls (`StructureError`)."""
     mode = _hidden_mode(model.A.T, model.B[:, list(left)].T)
     if mode:
@@ -162,7 +159,7 @@ def _hidden_mode(A: Array, C: Array) -> str:
     return ""
 
 
-def _names(model: "HammersteinSS", lost: Sequence[str]) -> tuple[str, ...]:
+def _names(model: HammersteinSS, lost: Sequence[str]) -> tuple[str, ...]:
     """Return the names of outputs, given with their part or without, in their order."""
     places = sorted({channel_of(model.outputs, name if ":" in name else f":{name}") for name in lost})
     return tuple(model.outputs[o] for o in places)
@@ -172,7 +169,7 @@ def _names(model: "HammersteinSS", lost: Sequence[str]) -> tuple[str, ...]:
 class LearntSensor:
     """A lost output as a linear function of the last readings of the others and of the last inputs."""
 
-    model: "HammersteinSS"  # gives the nonlinearities of the inputs and the names
+    model: HammersteinSS  # gives the nonlinearities of the inputs and the names
     lost: tuple[str, ...]  # names of the outputs that are estimated
     method: str  # "conditional mean" or "subspace"
     lags: int  # samples of the past, the present one included
@@ -197,7 +194,7 @@ class LearntSensor:
         return one_or_all(found)
 
 
-def conditional_mean(model: "HammersteinSS", data: Data, lost: Sequence[str], *, lags: int = LAGS) -> LearntSensor:
+def conditional_mean(model: HammersteinSS, data: Data, lost: Sequence[str], *, lags: int = LAGS) -> LearntSensor:
     """Learn a lost sensor from healthy data: the mean of its reading given the last ones of the others and the inputs.
 
     Args:
@@ -222,7 +219,7 @@ def conditional_mean(model: "HammersteinSS", data: Data, lost: Sequence[str], *,
 
 
 def subspace_projection(
-    model: "HammersteinSS", data: Data, lost: Sequence[str], *, lags: int = LAGS, rank: int | None = None
+    model: HammersteinSS, data: Data, lost: Sequence[str], *, lags: int = LAGS, rank: int | None = None
 ) -> LearntSensor:
     """Learn a lost sensor from healthy data: the point of the signal subspace that agrees with the other channels.
 
@@ -240,7 +237,7 @@ def subspace_projection(
     return LearntSensor(model, names, "subspace", lags, weights, constant, residual)
 
 
-def _learning(model: "HammersteinSS", data: Data, lost: Sequence[str], lags: int, per_weight: int
+def _learning(model: HammersteinSS, data: Data, lost: Sequence[str], lags: int, per_weight: int
               ) -> tuple[tuple[str, ...], Array, Array]:
     """Names of the lost, and complete windows of a healthy record: as `_stacked`."""
     names = _names(model, lost)
@@ -257,7 +254,7 @@ def _learning(model: "HammersteinSS", data: Data, lost: Sequence[str], lags: int
     return names, rows[complete], readings[complete]
 
 
-def _stacked(model: "HammersteinSS", u: Array, y: Array, lost: tuple[str, ...], lags: int) -> tuple[Array, Array]:
+def _stacked(model: HammersteinSS, u: Array, y: Array, lost: tuple[str, ...], lags: int) -> tuple[Array, Array]:
     """[other readings; f(u)] and the lost readings of every lag, the newest first, (N - lags + 1, p)."""
     gone = np.isin(model.outputs, lost)
     count = max(len(y) - lags + 1, 0)

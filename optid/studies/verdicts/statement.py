@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from optid.phrases import plural
+from optid.phrases import and_joined, plural
 from optid.program.solution import tolerance
 
 Key = TypeVar("Key")
@@ -56,4 +56,4 @@ def join_names(names: Sequence[str], most: int = 4) -> str:
         names = [f"\u201c{name}\u201d" for name in names]
     if len(names) > most:
         return ", ".join(names[: most - 1]) + f" and {len(names) - most + 1} more"
-    return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
+    return and_joined(names)
