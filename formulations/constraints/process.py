@@ -111,13 +111,14 @@ def _bounded(word: str, names: Sequence[str], value: float | None, low: float | 
     logarithmic = names[0].startswith("log ")
     if logarithmic:
         _refuse_below(word, np.finfo(float).tiny, value, low, high)
-    given = {"value": value} if value is not None else {"low": low, "high": high}
+    bounds = {"value": value} if value is not None else {"low": low, "high": high}
+    given = {kind: bound for kind, bound in bounds.items() if bound is not None}
 
     def build(view: View) -> list[Limit]:
         one, found = _input(view, word, names, pair), []
         entries = [view[view.key(name, one)] for name in names if view.key(name, one) in view]
         for kind, bound in given.items():
-            for entry in entries if bound is not None else ():
+            for entry in entries:
                 end, unit = (np.log(bound), 1 / bound) if logarithmic else (bound, 1.0)
                 member = entry == end if kind == "value" else entry >= end if kind == "low" else entry <= end
                 found.append(Limit(member, unit, kind))

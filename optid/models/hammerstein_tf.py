@@ -72,7 +72,8 @@ class HammersteinTF(Model):
     GAUGES = GAUGES
     SIMULATORS = ("predict", "free")
     equation, coefficients, noise = text.equations, text.coefficients, property(text.noise)
-    state, following, _fitted = transfer_states.state, transfer_states.following, transfer_states.fit_state
+    state, following = transfer_states.state, transfer_states.following
+    _fitted = transfer_states.fit_state  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
         a, offset = finite(self.a, "a"), np.atleast_1d(finite(self.offset, "offset"))

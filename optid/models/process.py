@@ -273,7 +273,9 @@ class ProcessModel(Model):
         found = []
         for (u, y, label), state, times in zip(records, states, stamps or [None] * len(records)):
             own, motion = self._courses(u, label, times)
-            found.append(own + motion @ (self._least(motion, y - own, label) if state is None else state))
+            if state is None:
+                state = self._least(motion, y - own, label)  # pyright: ignore[reportOptionalOperand]
+            found.append(own + motion @ state)
         return found
 
     def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:

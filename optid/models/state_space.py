@@ -209,7 +209,7 @@ class StateSpace(Model):
         A, B, C, D = (one[0] for one in self.tangent(x[None], y[None], u0[None]))
         return D - C @ static_solution(A - np.eye(self.nx), B)
 
-    _static_gain = gain_at_rest
+    _static_gain = gain_at_rest  # pyright: ignore[reportAssignmentType]
 
     def tangent(self, x: Array, y: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """Return A, B, C, D of the free run near states (N, n), outputs (N, l) and inputs (N, m), N of each."""
