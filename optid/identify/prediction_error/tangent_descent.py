@@ -306,7 +306,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS, 
     damping, growth, weight, last, idle, more = 0.0, 4.0, 0.0, np.inf, 0, 0
     answered, curvature, since = False, Curvature(here.x.size), here.at.value
     entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
-    rival, passed = rival / here.criterion.unit, np.inf
+    rival, passed = rival / criterion_of(here.problem).unit, np.inf
     for count in range(1, most + 1):
         if count % OVER == 0:
             if entered and here.at.value - AHEAD * (passed - here.at.value) > rival:
