@@ -89,20 +89,30 @@ def search(tables, grams, tested, z, q, floor):
     of, F, e = tables.of, tables.F, tables.e
     lasting, drifts, helpers = tables.lasting, tables.drifts, tables.helpers
     count, n, columns, candidates = of.size, F.shape[1], e.shape[2], tables.first.size
-    most = max(1, tables.sizes.max())
+    most = 1
+    for c in range(candidates):
+        most = max(most, tables.sizes[c])
     x, later = np.zeros((n, columns)), np.zeros((n, columns))
     cross, cosines = np.zeros((columns, columns)), np.zeros((most, most))
     work = np.zeros((most, most + 1))
-    best = np.full((candidates, candidates), -np.inf)
-    onsets = np.full((candidates, candidates, 2), -1)
+    best, onsets = np.empty((candidates, candidates)), np.empty((candidates, candidates, 2), dtype=np.int64)
+    for c in range(candidates):
+        for other in range(candidates):
+            best[c, other], onsets[c, other, 0], onsets[c, other, 1] = -np.inf, -1, -1
     alike, last = 0, 0
     for k in range(count):
-        if tested[:, k].any():
-            last = k
+        for c in range(candidates):
+            if tested[c, k]:
+                last = k
     for theta in range(count):
-        if not tested[:, theta].any():
+        any_here = False
+        for c in range(candidates):
+            any_here = any_here or tested[c, theta]
+        if not any_here:
             continue
-        x[:] = 0.0
+        for a in range(n):
+            for i in range(columns):
+                x[a, i] = 0.0
         for k in range(theta, last + 1):
             t = of[k]
             age = k - theta
@@ -164,5 +174,7 @@ def search(tables, grams, tested, z, q, floor):
                     for b in range(n):
                         for i in range(columns):
                             later[a, i] += F[t, a, b] * x[b, i]
-                x[:] = later
+                for a in range(n):
+                    for i in range(columns):
+                        x[a, i] = later[a, i]
     return best, onsets, alike

@@ -52,6 +52,14 @@ def correlate(tables, r, found):
 
 
 @cached_njit
+def clear(matrix):
+    """Set a matrix to zero."""
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            matrix[i, j] = 0.0
+
+
+@cached_njit
 def add(result, first, second):
     """Add first' second to a matrix."""
     for a in range(first.shape[0]):
@@ -83,7 +91,9 @@ def grams(tables, slots, products, states):
         k = count - 1 - step
         t = of[k]
         # after this sample a lasting column continues, a drift continues on top of its helper, a jump has ended
-        carried[:, : lasting + drifts] = P[:, : lasting + drifts]
+        for j in range(columns):
+            for i in range(n):
+                carried[i, j] = P[i, j] if j < lasting + drifts else 0.0
         for j in range(drifts):
             for i in range(n):
                 carried[i, lasting + j] += P[i, helpers + j]
@@ -100,11 +110,13 @@ def grams(tables, slots, products, states):
                         kept[i, j] += H[helpers + i - lasting, helpers + j - lasting]
         # S = W'W, weighed = S h, seen = S C, pushed = carried + M e; S and M are symmetric
         for matrix in (S, weighed, seen, moved):
-            matrix[:] = 0.0
+            clear(matrix)
         add(S, W[t], W[t])
         add(weighed, S, h[t])
         add(seen, S, C)
-        pushed[:] = carried
+        for i in range(n):
+            for j in range(columns):
+                pushed[i, j] = carried[i, j]
         add(pushed, M, e[t])
         for i in range(columns):
             for j in range(columns):
@@ -118,13 +130,14 @@ def grams(tables, slots, products, states):
                     if slots[i, j] >= 0:
                         products[k, slots[i, j]] = total
         # P = C' weighed + F' pushed, M = C' seen + F' M F
-        P[:] = 0.0
+        clear(P)
         add(P, C, weighed)
         add(P, F[t], pushed)
-        if whole:
-            states[k] = P
+        for i in range(n if whole else 0):
+            for j in range(columns):
+                states[k, i, j] = P[i, j]
         add(moved, M, F[t])
-        M[:] = 0.0
+        clear(M)
         add(M, C, seen)
         add(M, F[t], moved)
 
