@@ -261,6 +261,22 @@ class StateSpace(Model):
         return self if self.nx == 0 else self.transform(
             balancing(self.A, np.hstack([self.B, self.E, self.Ez]), np.vstack([self.C, self.Cz])))
 
+    def inject_output(self, gain: ArrayLike) -> Self:
+        """Move gain times the output out of A into L: A - gain C, L + gain, K - gain.
+
+        P1 and P3 do not change; P2 does, since it feeds back the measured output. With a gain (n, l) of -L the
+        injection is absorbed into A.
+        """
+        if self.levels is not None:
+            raise StructureError("A model with levels feeds back no output, whose zero would act: choose a level by "
+                                 "at_level first.")
+        moved = np.asarray(gain, dtype=float)
+        if moved.shape != self.L.shape:
+            raise StructureError(f"The gain has shape {moved.shape}; it must be {self.L.shape}.")
+        return replace(
+            self, A=self.A - moved @ self.C, B=self.B - moved @ self.D, L=self.L + moved, K=self.K - moved,
+            Ez=self.Ez - moved @ self.Fz, offset_x=self.offset_x - moved @ self.offset_y, noise=None, gauge="none")
+
     def _regauged(self, gauge: str, signs: bool) -> Self:
         if gauge == "gain":
             scales = self._gains()

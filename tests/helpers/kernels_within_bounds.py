@@ -19,8 +19,10 @@ kernels, compile_kernel = [], kernel_cache.cached_njit
 def recorded(function=None, /, **options):
     if function is None:
         return lambda one: recorded(one, **options)
-    kernels.append(compile_kernel(function, **options))
-    return kernels[-1]
+    kernel = compile_kernel(function, **options)
+    if options.get("inline") != "always":  # which is compiled, and checked, with its callers
+        kernels.append(kernel)
+    return kernel
 
 
 kernel_cache.cached_njit = recorded

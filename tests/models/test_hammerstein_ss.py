@@ -273,6 +273,18 @@ def test_balanced_gramians(model):
     refuses(StructureError, "not minimal", HammersteinSS(np.diag([0.5, 0.4]), [[1.0], [0.0]], [[1.0, 1.0]]).balance)
 
 
+def test_injection_leaves_prediction_and_free_run_alone():
+    model = with_feedback()
+    data = record(model)
+    moved = model.inject_output(np.random.default_rng(0).normal(size=(3, 2)))
+    assert moved.predict(data) == pytest.approx(model.predict(data), abs=1e-9)
+    assert moved.simulate(data, x0=X0) == pytest.approx(model.simulate(data, x0=X0), abs=1e-9)
+    assert not np.allclose(moved.simulate_measured_feedback(data, x0=X0), model.simulate_measured_feedback(data, X0))
+    absorbed = model.inject_output(-model.L)
+    assert not absorbed.L.any() and absorbed.A == pytest.approx(model.A + model.L @ model.C)
+    refuses(StructureError, "gain has shape", model.inject_output, np.ones((2, 3)))
+
+
 @pytest.mark.parametrize("gauge", ["norm", "none"])
 @pytest.mark.parametrize("model", [linear(), with_feedback()])
 def test_predictions_do_not_depend_on_the_gauge(model, gauge):

@@ -11,7 +11,7 @@ from optid import Data
 from optid.backends.back_end import BackEnd
 from optid.backends.choice import back_ends
 from optid.cli.results import solver_choice
-from optid.errors import DataWarning, LookupFailed, OptidError, SolverRefused, StructureError
+from optid.errors import DataWarning, LookupFailed, SolverRefused, StructureError
 from optid.program.solution import Status
 from optid.registry import FORMULATIONS, defaults, find_entry_points, formulation
 from optid.solving.steps import choose_solvers, takers
@@ -164,15 +164,3 @@ def test_the_command_line_names_steps():
     assert solver_choice("scs") == "scs"
     assert solver_choice("shift with fixed P=scs, split=ipopt") == {"shift with fixed P": "scs", "split": "ipopt"}
     refuses(StructureError, "'shift' twice", solver_choice, "shift=scs,shift=clarabel")
-
-
-def test_studies_compare_solvers_of_the_main_step():
-    from optid.studies.execution.cell import _check_main_step
-
-    class Cell:
-        formulation_name, options, constraints, solver_name = "subspace.nuclear", {"nx": 1}, (), "osqp"
-
-    refuses(SolverRefused, "'low rank', the main step", _check_main_step, Cell)
-    Cell.solver_name = "scs"
-    _check_main_step(Cell)
-    assert issubclass(SolverRefused, OptidError)

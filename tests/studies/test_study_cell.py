@@ -236,6 +236,8 @@ def test_nothing_held_out():
 @pytest.mark.parametrize("cell, outcome, words", [
     (lambda: one("clarabel"), "refused", "is not convex and is taken by alternating"),
     (lambda: replace(one(), solver_name="gurobi"), "refused", "pip install gurobipy"),
+    (lambda: replace(one("osqp"), formulation_name="subspace.nuclear", options={"nx": 1}), "refused",
+     "osqp does not take 'low rank', the main step"),
     (lambda: replace(one(), options={**OPTIONS, "na": -1}), "error", "StructureError.*na"),
     (lambda: replace(one(), options={**OPTIONS, "nab": 1}), "error", "takes no argument 'nab'"),
     (lambda: one(options={**OPTIONS, "na": 200, "nb": 200}), "error", "RankError"),
