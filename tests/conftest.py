@@ -25,8 +25,8 @@ report solving study_database validation""".split()
 NUMERICAL = """solving/ formulations/ fault_pairs fault_profile fault_scan fault_signature fitting readme
 uncertainty""".split()
 SLOW = """workbench/ clusters diagnosis encoding fault_alternatives fault_scan hard_over isolability monitor
-monitor_arl monitor_cli physical processes random_commands real_faults reformulation solver_fallback state_shooting
-study_cli study_description study_examples study_running study_third_party study_verdict_figures
+monitor_arl monitor_cli monitor_stops physical processes random_commands real_faults reformulation solver_fallback
+state_shooting study_cli study_description study_examples study_running study_third_party study_verdict_figures
 study_workers""".split()
 
 

@@ -27,6 +27,7 @@ from optid.show.printing import describe
 from optid.show.report import render
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("seed", [1, 20, 21, 77, 5431])
 def test_a_random_fit_can_be_used_in_every_way(seed, tmp_path):
     assert troubles(seed, tmp_path) == []

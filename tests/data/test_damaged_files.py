@@ -64,6 +64,7 @@ def read_record(path, read=optid.read):
     assert isinstance(found, optid.Data) or list(found)  # a pass over a stream
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("kind", "read"), [
     *((kind, optid.read) for kind in ("csv", "parquet", "npz", "npz-packed", "npy")),
     *((kind, optid.open_stream) for kind in ("csv", "parquet", "npy"))])

@@ -402,7 +402,7 @@ KINDS = {
     "others": {"u": U, "y": Y * 1j, "s": sparse.csc_matrix(UU), "o": Object("table"), "e": EMPTY, "b": U > 0}}
 
 
-@pytest.mark.sampled(6)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [4, pytest.param(8, marks=pytest.mark.slow)])
 def test_damaged_files_are_read_or_refused_by_name(save, kind, count):

@@ -76,6 +76,7 @@ def test_few_moves_or_samples_are_left_out_whole():
         assert [len(parts) for parts in Blocks.of(data, 4).parts] == [1] * 4
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("seed", range(6))
 def test_equal_experiments_of_a_nonlinear_plant_are_open(seed):
     """What linear dynamics miss is the same in all three, and the future of few moves tells it by chance."""

@@ -161,6 +161,7 @@ def told(events, until):
     return {label for label, _ in named[-1].candidates}, named[-1]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
 @pytest.mark.parametrize("listed", [("bias", "loss"), ("bias", "loss", "stuck")])
 @pytest.mark.parametrize("seed", range(3))

@@ -70,6 +70,7 @@ def checked(name, word, seed, **more):
     return fit.solution.status, gain, poles
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("word", ["stable:0.7", "disc:0.5,0.2", "strip:0.2,0.6"])
 def test_poles_that_meet_on_the_border_are_followed_to_a_double_pole(word):
     status, gain, poles = checked("ss.exact", word, 0, poles=[0.93, 0.88], noise=0.1)

@@ -330,6 +330,7 @@ def test_bounds_for_two_poles_lie_below_every_point(moves):
     check_bounds(errors, boxes, [*rng.uniform(0, 1, (4, 150, 3)), *rng.integers(0, 2, (4, 150, 3))], 50)
 
 
+@pytest.mark.slow
 def test_a_monotone_curve_of_few_increments_is_proved():
     u = np.repeat([0.0, 2, 1, 0, 1, 2], 15)
     data = record(process_model("P1D", K=2.0, tau=8.0, dead_time=4.4), np.minimum(u, 1.2), 0.05)

@@ -158,6 +158,7 @@ def test_cones_of_smooth_bases_hold_between_their_points(basis, rule, order):
     assert min(np.max(-steps), np.max(steps)) < 1e-4 * np.max(np.abs(steps)) + 3e-5 * (order == 1)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("form, arguments, near", [
     ("hammerstein_arx.exact", {"na": 1, "nb": 1, "nk": 1}, 1e-7),
     ("hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": 1}, 3e-6),

@@ -523,6 +523,7 @@ def test_a_pool_survives_the_death_of_a_process():
         assert found[1] is None and [x for x in found if x is not None] == [0, 2, 3]
 
 
+@pytest.mark.slow
 def test_what_hangs_ends_with_the_time(monkeypatch):
     monkeypatch.setattr("optid.identify.search.pool.GRACE", 3.0)
     with closing(TrialPool(hang, 2)) as pool:

@@ -32,7 +32,7 @@ RESULTS = {
 }
 
 
-@pytest.mark.sampled(4)
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("name", RESULTS)
 def test_every_result_is_pickled_and_shown_in_three_lines(name):
     result = RESULTS[name]()

@@ -23,6 +23,7 @@ RESULTS = {"thruster": lambda: example_fit("thruster"), "mimo fit": mimo_fit, "l
            "silent": lambda: siso(b=([0.0, 0.0],), nk=1)}
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("result", RESULTS)
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_figure_is_drawn_without_a_warning_and_leaves_no_trace(result, name, tmp_path):

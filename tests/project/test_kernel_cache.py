@@ -66,6 +66,7 @@ def test_code_is_kept_and_found(kernel, tmp_path):
     assert found(X) == 10.0 and sum(found.stats.cache_hits.values()) == 1
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 @pytest.mark.parametrize("damage", [cut, empty, garbage, flip, other])
 def test_a_damaged_cache_is_told_and_replaced(kernel, tmp_path, ending, damage):

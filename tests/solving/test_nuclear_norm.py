@@ -95,7 +95,7 @@ def test_the_predictor_is_block_toeplitz_and_causal():
     assert np.any(whole[0, :, 0, :2]) and not np.any(whole[0, :, 0, 2:])  # outputs act with a delay
 
 
-@pytest.mark.sampled(16)
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("missing", [0, 6])
 @pytest.mark.parametrize("weight", [0.1, 1.0, 10.0])
