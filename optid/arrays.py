@@ -181,6 +181,12 @@ def finite(values: Any, name: str, largest: float = LARGEST) -> np.ndarray:
     return array
 
 
+def kron(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the Kronecker product of two matrices, which takes `numpy.kron` several times as long for small ones."""
+    product = left[:, None, :, None] * right[None, :, None, :]
+    return product.reshape(left.shape[0] * right.shape[0], left.shape[1] * right.shape[1])
+
+
 def compact(array: Any) -> np.ndarray:
     """Return an array in the one form that kernels are compiled for: float64, contiguous, not marked as read-only."""
     return np.require(array, dtype=float, requirements=["C", "W"])

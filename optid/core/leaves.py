@@ -15,7 +15,7 @@ import scipy.sparse as sp
 from cvxpy.lin_ops.lin_utils import ID_COUNTER, get_id
 from numpy.typing import NDArray
 
-from optid.arrays import Array
+from optid.arrays import Array, kron
 from optid.core.terms import Values, flat
 
 DENSE = 1_000_000  # entries of a matrix up to which it is an array
@@ -49,7 +49,7 @@ class Product:
     def slope(self, x: Values) -> dict[str, Array]:
         """Return the derivative of the flat product by every factor."""
         mu, b = flat(x[self.mu]), flat(x[self.b])
-        return {self.mu: np.kron(b[:, None], np.eye(mu.size)), self.b: np.kron(np.eye(b.size), mu[:, None])}
+        return {self.mu: kron(b[:, None], np.eye(mu.size)), self.b: kron(np.eye(b.size), mu[:, None])}
 
     def chain(self, pull: Array, x: Values) -> dict[str, Array]:
         """Return ``slopeᵀ pull`` without forming the slope."""

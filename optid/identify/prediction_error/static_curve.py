@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, kron
 from optid.core.leaves import Quantity
 from optid.core.terms import Values
 
@@ -25,9 +25,9 @@ def _slope(mu: str, b: str, x: Values) -> dict[str, Array]:
     gain, seen, rest = _gains(b, x)
     curve, size = np.reshape(x.get(mu, np.ones(1)), (-1, 1)), len(gain)
     direct = np.eye(size) if np.size(x[b]) > len(rest) else np.zeros((size, 0))
-    by = {"A": np.kron(rest, seen), "C": np.kron(rest, np.eye(size)), b: np.hstack([seen, direct])}
-    found = {name: np.kron(part, curve) for name, part in by.items()}
-    return {**found, mu: np.kron(gain[:, None], np.eye(len(curve)))} if mu in x else found
+    by = {"A": kron(rest[None], seen), "C": kron(rest[None], np.eye(size)), b: np.hstack([seen, direct])}
+    found = {name: kron(part, curve) for name, part in by.items()}
+    return {**found, mu: kron(gain[:, None], np.eye(len(curve)))} if mu in x else found
 
 
 def _gains(b: str, x: Values) -> tuple[Array, Array, Array]:

@@ -9,6 +9,7 @@ solved by the back end that was asked for: that it offers no better point is wha
 
 from collections.abc import Generator, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -68,7 +69,7 @@ def refine(problem: Problem, found: Descent, figures: Mapping[str, Any], x: Arra
     if not np.isfinite(here.at.value):
         raise RankError("no start has a run that stays within its range; use another order or another basis")
     figures = {**figures, "Gauss-Newton steps": found.steps}
-    if here.tangent.constraint_names:
+    if problem.constraint_names:
         # how well the record tells the unknowns: a constraint that it contradicts may end where f is all but flat
         figures["condition"] = found.at.condition
         criterion = criterion_of(problem)
@@ -186,7 +187,6 @@ class _Iterate:
     problem: Problem
     x: Array
     at: Linearised
-    tangent: Problem  # that of the step from here
     outside: float  # largest violation, relative
     amount: float  # sum of the absolute violations of the user's constraints
 
@@ -197,16 +197,24 @@ class _Iterate:
         at = criterion.linearise(x)
         outside = excess(problem, x) if problem.builders else 0.0
         amount = problem.violation(criterion.variables.values(x)) if outside > NOWHERE else 0.0
-        return cls(problem, x, at, step_problem(problem, x, at, 0.0), outside, amount)
+        return cls(problem, x, at, outside, amount)
+
+    @cached_property
+    def tangent(self) -> Problem:
+        """The problem of the undamped step from here."""
+        return step_problem(self.problem, self.x, self.at, 0.0)
 
     def move_to(self, x: Array) -> "_Iterate | None":
         """Return the iterate at x, None where it is inadmissible, its run explodes or its gauge cannot be reached."""
         criterion = criterion_of(self.problem)
         x = criterion.confine(x)
-        try:
-            return _Iterate.of(self.problem, x) if criterion.admissible(x) and np.isfinite(criterion.value(x)) else None
-        except StructureError:
+        if not criterion.admissible(x):
             return None
+        try:
+            there = _Iterate.of(self.problem, x)
+        except (StructureError, np.linalg.LinAlgError):
+            return None
+        return there if np.isfinite(there.at.value) else None
 
     def merit(self, weight: float) -> float:
         return self.at.value + weight * self.amount
@@ -330,7 +338,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS, 
             continue
         answered, step = True, here.step(solution)
         gain, new = here.gain(step, at), here.move_to(here.x + step)
-        duals = [solution.duals[name] for name in here.tangent.constraint_names if name in solution.duals]
+        duals = [solution.duals[name] for name in here.problem.constraint_names if name in solution.duals]
         needed = max((2.0 * float(np.max(np.abs(dual), initial=0.0)) for dual in duals), default=0.0)
         weight = max(needed, (weight + needed) / 2)  # multipliers far from the constraints may be huge
         if here.at.value < since * (1 - BETTER):  # little is promised, and more is gained in between
