@@ -537,10 +537,6 @@ def test_a_file_that_went_after_it_was_checked_is_told(rig):
 # -- records -----------------------------------------------------------------------------------------------------------
 
 
-def _cell(study, **changes):
-    return replace(grid.cells(study)[0], **changes)
-
-
 def test_files_are_cut_and_simulated_records_keep_their_length(rig):
     study = Study("t", data=[{"file": "rig.csv", "inputs": "current", "outputs": "thrust"}, "thruster"],
                   solvers="auto", formulations={"formulation": "arx", "na": 2, "nb": 1}, folder=rig, holdout=0.25)
