@@ -160,7 +160,7 @@ class Criterion(ABC):
 
     @abstractmethod
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
-        """Return the errors near x, compressed by a method of `optid.statistics.linearised`."""
+        """Return the errors near x, compressed by a method of `optid.statistics.linearised`; infinite as in `value`."""
 
     @abstractmethod
     def rows(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
