@@ -196,8 +196,10 @@ def test_files_that_are_not_there_or_not_text(tmp_path):
 
 @pytest.mark.parametrize("text, key, words", [
     (SMALL.replace("nb = 1", "nb = -1", 1), "formulation['arx']", "nb of input 'current' must be a positive integer"),
+    (SMALL.replace("nb = 1", 'nb = 1\nconstraints = "saturation:-50,50"', 1),
+     "formulation['arx + saturation:-50,50']", "does not fit the data: saturation levels"),
     (SMALL.replace("nb = 1", 'nb = 1\nconstraints = "saturation:5,1"', 1),
-     "formulation['arx + saturation:5,1']", "does not fit the data: "),
+     "formulation[0].constraints[0]", "saturation needs low <= high; got 5.0, 1.0"),
     (SMALL.replace("[[data]]", "[data]"), "data", "written as [[data]], with two brackets"),
     (SMALL.replace("[[data]]", "[[datas]]"), "datas", "Did you mean 'data'"),
     (SMALL.replace('solvers = ["clarabel", "gauss_newton"]', 'solver = "clarabel"'), "solver", 'solvers = "auto"'),
