@@ -30,11 +30,24 @@ data = optid.Data(u=u, y=y)
 ASIVID = RECORD + """
 optid.fit(data, "hammerstein_ss.asivid", nx=3, basis=optid.Triangular(6), feedback_basis=optid.Polynomial(3))
 """
+MONITOR = """
+import optid
+from optid.faults import Monitor
+Monitor(optid.load("{folder}/model.json"))
+"""
+DIAGNOSE = """
+import optid
+from optid.examples import broken_thruster
+from optid.faults import diagnose
+diagnose(optid.load("{folder}/model.json"), broken_thruster().data)
+"""
 JOBS: dict[str, list[str]] = {
     "fit": FIT,
     "report": [*FIT, "--report", "{folder}/report.html"],
     "asivid": [sys.executable, "-c", ASIVID],
     "oe": [*FIT, "--formulation", "oe.exact"],
+    "monitor": [sys.executable, "-c", MONITOR],
+    "diagnose": [sys.executable, "-c", DIAGNOSE],
     "isolability": [*OPTID, "isolability", "{folder}/model.json"],
     "formulations": [*OPTID, "formulations"],
     "constraints": [*OPTID, "constraints"],
