@@ -101,6 +101,8 @@ def _may_hold(parts: Sequence[Array]) -> bool:
     least = (1 - CAREFUL / np.sqrt(some.size)) * FAR * middle / NORMAL_MEDIAN
     for x in parts:
         jumps = np.flatnonzero(np.abs(np.diff(x)) > least / STEP)
+        if not jumps.size:
+            continue
         edges = (jumps < half) | (jumps >= x.size - half - LONGEST)
         runs = jumps[:-1][np.diff(jumps) <= LONGEST]  # there and back
         near = runs[:, None] + np.arange(1, 1 + LONGEST)
