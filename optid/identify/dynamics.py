@@ -393,4 +393,6 @@ class _Reading:
 
     @staticmethod
     def _ratio(above: str, below: str) -> str:
+        if (above, below) == ("N", "A"):  # N/A would read as "not available"
+            return "N per A"
         return f"{above or 1}/{below}" if below else above

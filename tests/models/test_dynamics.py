@@ -53,6 +53,13 @@ def test_natural_frequency_and_damping_of_a_pair(zeta):
     assert found["damping"].estimate == pytest.approx(zeta)
 
 
+@pytest.mark.parametrize(("above", "below", "unit"), [
+    ("N", "A", "N per A"), ("N", "V", "N/V"), ("", "V", "1/V"), ("N", "", "N"), ("", "", "")])
+def test_the_unit_of_a_gain_is_not_read_as_not_available(above, below, unit):
+    model = transfer([0.5], input_units=(below,), output_units=(above,))
+    assert dynamics(model, UNIT)["static gain"].unit == unit
+
+
 @pytest.mark.parametrize(("nk", "dead"), [(0, 0.0), (1, 0.0), (2, 0.5), (11, 5.0)])
 def test_dead_time_does_not_count_the_sample_of_the_hold(nk, dead):
     found = dynamics(transfer([0.5], nk=nk, dt=0.5), UNIT)
