@@ -354,7 +354,7 @@ class Definition:
     data: Annotated[tuple[DataEntry, ...], Field(min_length=1), AfterValidator(_distinct), BeforeValidator(_data_axis)]
     formulations: Annotated[
         tuple[Annotated[Any, PlainValidator(_formulations_of)], ...], Field(min_length=1),
-        AfterValidator(lambda several: sum(several, ())), AfterValidator(_distinct),
+        AfterValidator(lambda several: _distinct(sum(several, ()))),
         BeforeValidator(lambda value: _spread(value, ("formulation",), lambda entry: entry))]
     solvers: Annotated[tuple[SolverEntry, ...], Field(min_length=1), AfterValidator(_distinct),
                        BeforeValidator(_solver_axis)]

@@ -165,8 +165,9 @@ def test_closing_ends_the_processes_of_the_cells_under_way(tmp_path):
     wait_for(lambda: len(log.read_text().splitlines()) >= 3)
     clock = time.monotonic()
     under_way.close()
+    assert time.monotonic() - clock < 30.0
     resting = {worker._process.pid for worker in _resting[os.getpid()]}  # those of other tests
-    assert time.monotonic() - clock < 30.0 and set(cell_workers(os.getpid())) <= resting
+    wait_for(lambda: set(cell_workers(os.getpid())) <= resting)  # killed; the system may still list them for a moment
     assert len(log.read_text().splitlines()) <= 5  # the others never start
 
 
