@@ -8,12 +8,15 @@ import pytest
 from test_core import exact_problem, record
 
 import optid
+from formulations.arx import _problem as arx_problem
 from optid.core.judge import judge, largest_excess
 from optid.core.leaves import LeafSpace, Quantity
+from optid.core.prices import price_constraints
 from optid.core.problem import Problem
 from optid.core.statement import for_solvers, is_stated, statement_of
 from optid.core.terms import GroupNorms, NuclearNorms, Squares
 from optid.errors import DataWarning
+from optid.identify.equation_error import EquationStructure, compress
 from optid.program.solution import relative_gap
 from optid.solving.solve import solve
 
@@ -163,3 +166,27 @@ def test_a_matrix_with_what_is_no_number_is_not_definite():
     space = LeafSpace({"x": np.eye(2)}, frozenset({"x"}))
     assert np.isnan(held.violation(space, {"x": np.full((2, 2), np.nan)}))
     assert held.violation(space, {"x": np.diag([1.0, -2.0])}) == pytest.approx(2.0)
+
+
+def test_degenerate_multipliers_are_priced_by_the_least():
+    def twice(v):
+        return {"one": v["a"][0] <= -1.0, "same": 2 * v["a"][0] <= -2.0, "idle": v["a"][1] >= -50}
+
+    problem = arx_problem(compress(RECORD, EquationStructure(2, 2, 1, "linear")), (twice,))
+    x, solution = solved(problem)
+    judged = judge(problem, x, solution.duals)
+    prices = {p.name: p.multiplier for p in price_constraints(problem, x, judged.duals, judged.objective)}
+    assert prices["one"] == pytest.approx(0, abs=1e-6 * solution.objective) == prices["same"] == prices["idle"]
+
+
+def test_multipliers_are_the_rates_of_the_optimum():
+    def optimum(high):
+        problem = arx_problem(compress(RECORD, EquationStructure(2, 2, 1, "linear")),
+                              (lambda v: {"high": v["a"][0] <= high},))
+        x, solution = solved(problem)
+        return solution.objective, judge(problem, x, {}), problem
+
+    _, found, problem = optimum(-1.0)
+    rate = (optimum(-1.001)[0] - optimum(-0.999)[0]) / 0.002  # the objective falls where the bound rises
+    (one,) = problem.constraints()
+    assert problem.unit * found.duals["high"][0] / one.sizes[0] == pytest.approx(rate, rel=1e-3)

@@ -376,3 +376,12 @@ def test_a_gain_is_kept_where_a_zero_of_c_comes_to_the_unit_circle(form, seed, g
     orders = {"na": 1, "nb": 1, "nk": 4, "nc": 1, **({"nd": 1} if form == "bj.exact" else {})}
     model = optid.fit(data, form, **orders, constraints=[f"gain:{gain}"]).model
     assert model.frequency_response(np.array([1e-9])).real.item() == pytest.approx(gain, abs=1e-9)
+
+
+@pytest.mark.parametrize("solver", ["clarabel", "osqp", "piqp"])
+def test_back_ends_agree(solver):
+    if solver not in [name for name, end in optid.backends.back_ends().items() if end.installed]:
+        pytest.skip(f"{solver} is not installed")
+    data, orders = record(system("armax"), (300,)), ORDERS["armax"][1]
+    reference = optid.fit(data, armax, **orders).solution.objective
+    assert quiet(data, armax, solver=solver, **orders).solution.objective == pytest.approx(reference, rel=1e-6)

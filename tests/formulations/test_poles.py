@@ -326,3 +326,9 @@ def test_real_poles_of_a_fit():
     poles = np.sort(fit.model.poles.real)
     assert np.max(np.abs(fit.model.poles.imag)) < 1e-6
     assert poles[0] <= 0.55 + 1e-6 and poles[1] >= 0.55 - 1e-6
+
+
+def test_a_slack_radius_changes_nothing():
+    free = optid.fit(record(), na=2, nb=2, basis=BASIS)
+    fit = optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=["stable:0.99"])
+    assert fit.solution.objective == pytest.approx(free.solution.objective, rel=1e-9)

@@ -629,3 +629,16 @@ def test_one_step_does_not_tell_coloured_noise_from_another_order(type_, word):
     verdict = fit(record(true, u=np.repeat(STEP, 2)), type_).verdict
     assert verdict.word == word
     assert [part.name for part in verdict.failed] == ["whiteness"] * (word == "fair")
+
+
+def test_bounds_are_part_of_the_proof():
+    found = fit(record(), constraints=["tau:high=25", "dead_time:low=14"])
+    assert found.solution.proof and found.solution.status is Status.OPTIMAL
+
+
+def test_the_record_is_not_modified():
+    data = record()
+    u, y = data.u.copy(), data.y.copy()
+    fit(data, "P2DZ")
+    np.testing.assert_array_equal(data.u, u)
+    np.testing.assert_array_equal(data.y, y)

@@ -314,3 +314,10 @@ def test_two_of_a_kind_get_names_of_their_own():
     assert [price.name for price in fit.prices] == ["through", "second point"]
     with pytest.raises(StructureError, match="two constraints named 'through'"):
         optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=[rules[0], rules[0]])
+
+
+def test_the_sign_rule_of_the_gauge_rests_where_a_constraint_fixes_a_sign():
+    fit = optid.fit(record(-1.0, noise=0.2), na=2, nb=2, basis=BASIS,
+                    constraints=[lambda v: {"rising": BASIS.increments() @ v["mu"] >= 0}, shape.sign("b", "negative")])
+    assert np.all(fit.model.b[0] < 0)
+    assert shaped(fit.model, GRID)[-1] > shaped(fit.model, GRID)[0]

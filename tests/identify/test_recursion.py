@@ -414,3 +414,13 @@ def test_like_takes_channels_and_ranges_from_a_record():
     recursion.read(data)
     assert recursion.model().inputs == data.inputs and "2 rows" not in repr(recursion)
     np.testing.assert_allclose(recursion.model().a, [-1.1, 0.3], atol=0.05)
+
+
+def test_a_large_prior_covariance_tends_to_the_batch_fit():
+    (u, y), theta = record(), {}
+    for P0 in (1e4, 1e8, 1e12, np.inf):
+        recursion = RecursiveARX(**CASES["triangular"], P0=P0)
+        recursion.update(u, y)
+        theta[P0] = recursion.theta
+    gaps = [np.abs(theta[P0] - theta[np.inf]).max() for P0 in (1e4, 1e8, 1e12)]
+    assert gaps[0] > 1e-7 and gaps[1] < 1e-3 * gaps[0] and gaps[2] < 1e-9

@@ -173,3 +173,10 @@ def test_a_constraint_on_f_decides_the_sign():
     fit = optid.fit(record(-1.0), na=2, nb=2, basis=BASIS, constraints=[
         lambda v: {"rising": BASIS.increments() @ v["mu"] >= 0}])
     assert fit.model.b[0].sum() < 0 and "the output falls with f" in str(fit)
+
+
+def test_without_constraints_it_is_the_manifold_method():
+    data = record(noise=1.0, count=60)
+    plain = optid.fit(data, na=2, nb=2, basis=BASIS)
+    idle = optid.fit(data, na=2, nb=2, basis=BASIS, constraints=[lambda v: {"idle": v["a"][0] >= -9}])
+    assert idle.solution.objective == pytest.approx(plain.solution.objective, rel=1e-10)

@@ -354,3 +354,11 @@ def test_a_general_nonlinear_solver_that_does_not_arrive_is_not_followed_by_anot
     monkeypatch.setattr("optid.solving.solve.choose", lambda program: (spent, "chosen"))
     found = solve(projection())
     assert (found.failed == name and found.status is Status.OPTIMAL) if followed else found.status is Status.LIMIT
+
+
+def test_old_multipliers_do_not_survive():
+    program = projection()
+    assert "budget" in solve(program, "clarabel").duals
+    found = solve(program, claiming({"x": [1.0, 1.0]}))
+    assert found.duals["budget"] == pytest.approx(2.0)
+    assert statement_of(program).duals() == {}  # ours, not those of before

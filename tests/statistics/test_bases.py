@@ -321,3 +321,14 @@ def test_constant_input_and_wrong_shape():
     refuses(DataError, "finite", Triangular(3).with_interval, np.nan, 2.0)
     refuses(DataError, r"\(N,\)", Triangular(3).with_interval(0, 1).values, np.zeros((4, 2)))
     assert Triangular(3, interval=(0, 1)).with_interval(5, 6).interval == (0, 1)
+
+
+@pytest.mark.parametrize("basis", [FITTED[1], BSpline(6, 1).with_interval(0, 1), BSpline(6, 2).with_interval(0, 1)])
+def test_shape_rows_are_necessary(basis):
+    rng = np.random.default_rng(7)
+    u = basis.grid(6001)
+    for _ in range(200):
+        mu = np.cumsum(np.abs(rng.normal(size=basis.size))) + 0.4 * rng.normal(size=basis.size)
+        f = basis.values(u) @ mu
+        assert (np.min(np.diff(f)) >= -1e-12) == (np.min(basis.increments() @ mu) >= -1e-9)
+        assert (np.min(np.diff(f, n=2)) >= -1e-11) == (np.min(basis.curvature() @ mu) >= -1e-9)

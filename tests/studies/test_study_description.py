@@ -632,3 +632,18 @@ def test_errors_that_cannot_be_told():
     assert np.isnan(other.parameter_error(model)) and np.isnan(other.nonlinearity_error(model))
     fed_back = Truth((np.sin,), ((-1, 1),))
     assert np.isnan(fed_back.parameter_error(model)) and fed_back.nonlinearity_error(model) < 0.1
+
+
+def test_data_that_changed_are_refused(rig):
+    study = Study("t", data={"file": "rig.csv", "inputs": "current", "outputs": "thrust"}, solvers="auto",
+                  formulations={"formulation": "arx", "na": 2, "nb": 1}, folder=rig)
+    before = grid.cells(study)
+    hashes = {("t", "rig"): {before[0].data_hash}}
+    grid.check_unchanged(before, hashes)
+    grid.check_unchanged(before, {("t", "another"): {"0"}, ("another", "rig"): {"0"}})
+    with open(rig / "rig.csv", "a") as file:
+        file.write("0.5,0.5\n")
+    after = grid.cells(study)
+    assert after[0].key != before[0].key
+    with pytest.raises(StudyError, match=r"(?s)rig: .*rig.csv.*--accept-changed-data"):
+        grid.check_unchanged(after, hashes)

@@ -66,3 +66,12 @@ def test_the_sign_test_counts_every_assignment_of_signs(lost, won):
     n = lost + won
     weights = np.array([math.comb(n, k) for k in range(n + 1)]) / 2**n
     assert sign_test(lost, won) == pytest.approx(weights[lost:].sum() if n else 1.0)
+
+
+def test_the_interval_of_a_paired_difference_covers_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(2000):
+        pair = paired_mean(1.0 + rng.normal(size=8), np.zeros(8), ratio=False)
+        hits += pair.low <= 1.0 <= pair.high
+    assert hits / 2000 == pytest.approx(0.95, abs=0.015)

@@ -4,6 +4,7 @@ import os
 import re
 import resource
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -169,3 +170,16 @@ def test_nothing_to_do_starts_nobody():
     before = set(psutil.Process().children())
     assert list(run_here([], behave, workers=1)) == []
     assert set(psutil.Process().children()) <= before
+
+
+def test_no_guard_of_the_main_module_is_needed(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(f"""
+import sys
+sys.path.insert(0, {str(Path(study_trouble.__file__).parent)!r})
+from study_trouble import behave, cell
+from optid.studies.execution.executors import run_here
+print("once", [row["outcome"] for row in run_here([cell(0)], behave, workers=1)])
+""")
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=600)
+    assert done.stdout == "once ['done']\n", done.stderr
