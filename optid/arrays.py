@@ -182,7 +182,7 @@ def finite(values: Any, name: str, largest: float = LARGEST) -> np.ndarray:
 
 
 def kron(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the Kronecker product of two matrices, which takes `numpy.kron` several times as long for small ones."""
+    """Return the Kronecker product of two matrices, small ones several times as fast as `numpy.kron`."""
     product = left[:, None, :, None] * right[None, :, None, :]
     return product.reshape(left.shape[0] * right.shape[0], left.shape[1] * right.shape[1])
 

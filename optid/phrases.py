@@ -35,3 +35,8 @@ def and_joined(words: Sequence[str]) -> str:
 def short(text: str, most: int = 120) -> str:
     """Cut a text to so many characters, the last of them an ellipsis."""
     return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def unit_ratio(above: str, below: str) -> str:
+    """Write the unit of a ratio; that of newtons and amperes in words, since N/A reads as not available."""
+    return "N per A" if (above, below) == ("N", "A") else f"{above or 1}/{below}" if below else above

@@ -19,6 +19,7 @@ from optid.identify.parameters import Parameter, Parameters
 from optid.models.functions import has_feedback
 from optid.models.model import AT_ONE
 from optid.models.roots import AT_ZERO, poles_of
+from optid.phrases import unit_ratio
 
 DECAYED = 1e-6  # share of their start to which the other modes fall before the slope of an integrator is read
 SAME = 1e-9  # of a sample: a smaller part is rounding
@@ -341,7 +342,7 @@ class _Reading:
             rows = self.limits("static gain", lambda model: np.reshape(
                 model.static_gain(self._middle()), (model.l, model.m))[:, c])
         return [_parameter(f"static gain{self._of(model.inputs[c], name)}", row,
-                           self._ratio(unit, model.input_units[c]))
+                           unit_ratio(unit, model.input_units[c]))
                 for name, unit, row in zip(model.outputs, model.output_units, rows)]
 
     def _quotients(self, gains: Callable[[Any], Array]) -> Array:
@@ -380,7 +381,7 @@ class _Reading:
 
         unit = f"{model.input_units[c]} {self.time}".strip()
         return [_parameter(f"slope{self._of(model.inputs[c], name)}", row,
-                           self._ratio(y, f"({unit})" if " " in unit else unit))
+                           unit_ratio(y, f"({unit})" if " " in unit else unit))
                 for name, y, row in zip(model.outputs, model.output_units, self.limits("slope", quantity))]
 
     def _middle(self) -> Array:
@@ -390,9 +391,3 @@ class _Reading:
         words = [output] if output and self.model.l > 1 else []
         words += [channel] if self.model.m > 1 else []
         return f"[{','.join(words)}]" if words else ""
-
-    @staticmethod
-    def _ratio(above: str, below: str) -> str:
-        if (above, below) == ("N", "A"):  # N/A would read as "not available"
-            return "N per A"
-        return f"{above or 1}/{below}" if below else above

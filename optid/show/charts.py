@@ -15,7 +15,7 @@ from optid.identify.validation import validate
 from optid.identify.validation.correlations import Correlation
 from optid.identify.validation.predictions import one_step_or_nan, simulate_outputs
 from optid.models.functions import StaticFunction, response_pairs, runs_free, static_functions
-from optid.phrases import p_equals
+from optid.phrases import p_equals, unit_ratio
 from optid.show import summary
 from optid.show.estimates import uncertainty
 from optid.show.sections import Axis, Chart, Series, decibels
@@ -200,7 +200,7 @@ def frequencies(model: Any, count: int = 300) -> Array:
 
 def ratio_unit(model: Any) -> str:
     """Return the unit of the responses, where all have the same and it is known; otherwise ""."""
-    units = {f"{y or 1}/{u}" if u else y for y in model.output_units for u in model.input_units}
+    units = {unit_ratio(y, u) for y in model.output_units for u in model.input_units}
     return units.pop() if len(units) == 1 else ""
 
 

@@ -9,6 +9,7 @@ from refusals import refuses
 
 import optid
 from formulations.hammerstein_arx import _factored
+from optid.arrays import kron
 from optid.core.constraint import symmetric_part
 from optid.core.judge import judge
 from optid.core.leaves import Product, Quantity
@@ -330,3 +331,11 @@ def test_an_unknown_that_is_to_be_symmetric_is_and_one_that_is_not_is_a_violatio
     assert found.objective == pytest.approx(value, rel=1e-3)
     skew = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     assert judge(problem, {"P": p + 0.1 * skew}, found.duals).residuals.violation > 0.01
+
+
+@pytest.mark.parametrize("left", [(1, 3), (4, 1), (0, 2), (2, 0)])
+@pytest.mark.parametrize("right", [(2, 2), (1, 5), (3, 0)])
+def test_kronecker_products_are_those_of_numpy(left, right):
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=left), rng.normal(size=right)
+    np.testing.assert_array_equal(kron(a, b), np.kron(a, b))

@@ -270,13 +270,13 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
         least = min((one.objective for one in ends), default=np.inf)
         end = yield from _constrained(_Iterate.of(problem, start), figures, SIGNED, least * (1 + CONFLICT))
         ends += [] if end is None else [end]
-    best, least = None, min((one.objective for one in ends), default=np.inf)
+    best, least, arrived = None, min((one.objective for one in ends), default=np.inf), np.inf
     for end in sorted(ends, key=lambda one: one.objective):
-        if end.objective <= least * (1 + CONFLICT) or best is None:
-            end = yield from _gone_on(problem, end, figures, np.inf if best is None else best.objective)
-            if _is_inside(problem, end) and (best is None or end.objective < best.objective):
-                best = end
-    return best or next(iter(ends), None)
+        if arrived == np.inf or end.objective <= least * (1 + CONFLICT):
+            end = yield from _gone_on(problem, end, figures, arrived)
+            inside = _is_inside(problem, end) and end.objective < arrived
+            best, arrived = (end, end.objective) if inside else (best or end, arrived)
+    return best
 
 
 def _gone_on(problem: Problem, end: Evidence, figures: Mapping[str, Any], rival: float) -> Procedure:
