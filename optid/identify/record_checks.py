@@ -62,11 +62,13 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
     for c, (name, basis) in enumerate(zip(data.inputs, bases)):
         records = [e.u[:, c] for e in data.experiments]
         u = _present("input", name, records)
-        found += _sentences(check_levels(name, u, basis))
+        if basis.size > 1:
+            found += _sentences(check_levels(name, u, basis))
         if (lags := _lags(arguments, c)) is not None:
             check = check_lines(name, records, basis, lags)
             found += _sentences(replace(check, severity="warning") if forced and check.severity == "error" else check)
-        found += list_outside("input", name, float(np.mean(basis.is_outside(u))), basis)
+        if basis.interval is not None:
+            found += list_outside("input", name, float(np.mean(basis.is_outside(u))), basis)
         found += _outliers("input", name, records, arguments)
     if (check := check_numbers(data, arguments)) is not None:
         found += _sentences(replace(check, severity="warning") if forced and check.severity == "error" else check)

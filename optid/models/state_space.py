@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -114,10 +114,10 @@ class StateSpace(Model):
         m = len(self.inputs) or 1 + max(fixed["input_of"], default=-1)
         shapes = _shapes(len(fixed["A"]), m, len(fixed["C"]), len(functions), len(fixed["feedback"]),
                          len(fixed["latent"]))
-        for name in MATRICES:
+        for name in (one for one in MATRICES if one not in fixed):
             given = getattr(self, name)
-            absent = given is None or (np.size(given) == 0 and 0 in shapes[name])
-            fixed.setdefault(name, finite(np.zeros(shapes[name]) if absent else given, name))
+            absent = given is None or (0 in shapes[name] and np.size(given) == 0)
+            fixed[name] = _zeros(shapes[name]) if absent else finite(given, name)
         self._fix(fixed, m, len(fixed["C"]))
         self._check(shapes)
         if self.levels is not None and (self.feedback or np.any(self.L)):
@@ -387,6 +387,12 @@ class StateSpace(Model):
         return super().from_dict({**content, **read(content, MATRICES), "noise": noise}, functions)
 
 
+@lru_cache
+def _zeros(shape: tuple[int, ...]) -> Array:
+    return finite(np.zeros(shape), "zeros")
+
+
+@lru_cache
 def _shapes(*sizes: int) -> dict[str, tuple[int, ...]]:
     """Shapes of the matrices for n, m, l, r, s and k."""
     size = dict(zip("nmlrsk", sizes))

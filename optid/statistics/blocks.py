@@ -65,6 +65,14 @@ class BlockSignals:
         """Whether some functions vanish at every sample."""
         return self.weights.shape[1] < self.size
 
+    def totals(self, samples: slice) -> Array:
+        """Return the sum (size,) of every signal over some samples."""
+        weights = self.weights[samples]
+        if not self.local:
+            return np.ones(len(weights)) @ weights
+        places = self.first[samples, None] + np.arange(weights.shape[1])
+        return np.bincount(places.ravel(), weights.ravel(), self.size)
+
 
 @dataclass(frozen=True)
 class Block:

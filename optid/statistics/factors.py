@@ -12,7 +12,7 @@ CONDITION_LIMIT = 1e5
 
 
 def _nonnegative_diagonal(root: Array) -> Array:
-    return root * np.where(np.diag(root) < 0, -1.0, 1.0)[:, None]
+    return root * np.where(root.diagonal() < 0, -1.0, 1.0)[:, None]
 
 
 def add_to_root(root: Array, rows: Array) -> Array:
@@ -29,7 +29,7 @@ def root_of_gram(gram: Array, n: int) -> Array:
     """
     from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore[reportAttributeAccessIssue]
 
-    scale = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    scale = np.sqrt(np.maximum(gram.diagonal(), 0.0))
     scale[scale == 0] = 1.0
     scaled = gram / np.outer(scale, scale)
     root = np.zeros_like(gram)
@@ -48,7 +48,7 @@ def root_of_gram(gram: Array, n: int) -> Array:
 def any_root_of_gram(gram: Array) -> Array:
     """Return an upper triangular R, diagonal >= 0, with R^T R = gram, also where columns depend on others."""
     root = root_of_gram(gram, len(gram))
-    return root if np.all(np.diag(root) > 0) else root_of_gram(gram, 0)
+    return root if np.all(root.diagonal() > 0) else root_of_gram(gram, 0)
 
 
 def root_of_rows(rows: Array) -> Array:
@@ -63,7 +63,7 @@ def root_of_rows(rows: Array) -> Array:
 def dependent_column(root: Array, n: int, method: str) -> int | None:
     """Return the first of n columns that depends on those before it to the rounding of the method, or None."""
     norms = np.linalg.norm(root[:, :n], axis=0)
-    dependent = np.diag(root)[:n] <= ROUNDING[method] * norms
+    dependent = root.diagonal()[:n] <= ROUNDING[method] * norms
     return int(np.argmax(dependent)) if dependent.any() else None
 
 
@@ -72,7 +72,7 @@ def conditioning(root: Array) -> float:
     from scipy.linalg.lapack import dtrcon  # pyright: ignore[reportAttributeAccessIssue]
 
     norms = np.linalg.norm(root, axis=0)
-    if not np.all(np.diag(root) > 0):
+    if not np.all(root.diagonal() > 0):
         return float("inf")
     reciprocal, _ = dtrcon(np.asfortranarray(root / norms))
     return 1 / reciprocal if reciprocal > 0 else float("inf")

@@ -2,7 +2,7 @@
 
 With instruments Z, regressors Phi and outputs Y (rows of one block Hankel matrix) and [Z; Phi; Y] = L Q,
 
-    [L21; L31] = [R11 0; R21 R22] Q',     range(Gamma) = range(R22),     H = R21 R11^-1.
+    [L21; L31] = [R11 0; R21 R22] Q',     range(Gamma) = range(R22).
 
 Sources: Chou and Verhaegen 1997 (instrumental variables), Verhaegen and Dewilde 1992 (past inputs and outputs as
 instruments: Z = [U_f; U_p; Y_p], Phi = U_f gives the singular values that SLICOT's IB01AD prints).
@@ -30,7 +30,6 @@ class RQ:
     # (y, r) outputs projected on the instruments, with the regressors removed: Gamma times the projected states
     r22: Array
     residual: Array  # (y, y) triangular factor of the outputs' part outside the instruments and regressors
-    gain: Array  # (y, p) H = R21 R11^-1 in units of the signals
     # condition number of the projected regressors, their rows scaled to the norm of the regressors themselves: it grows
     # with the record where instruments and regressors are not correlated
     condition: float
@@ -70,11 +69,11 @@ def rq(statistics: HankelStatistics, instruments: Sequence[int] | NDArray[np.int
     if z.size < phi.size:
         raise RankError(f"{z.size} instruments for {phi.size} regressors: use more block rows of instruments or fewer "
                         "basis functions.")
-    own = ~np.isin(phi, z)  # regressors that are not instruments themselves
-    order = np.concatenate([z, phi[own], y])
-    triangle = statistics.triangle(order)
-    column = {int(position): c for c, position in enumerate(order)}
-    of_phi = [column[int(position)] for position in phi]
+    column = np.full(len(statistics.gram), -1)
+    column[z] = 0
+    order = np.concatenate([z, phi[column[phi] < 0], y])  # of the regressors those that are not instruments themselves
+    column[order] = np.arange(order.size)
+    triangle, of_phi = statistics.triangle(order), column[phi]
     of_y = np.arange(order.size - y.size, order.size)
     l21, l31 = triangle[: z.size, of_phi].T, triangle[: z.size, of_y].T
     size = np.linalg.norm(triangle[:, of_phi], axis=0)  # of the regressors before the projection
@@ -85,20 +84,19 @@ def rq(statistics: HankelStatistics, instruments: Sequence[int] | NDArray[np.int
         weight = triangle[: z.size, : z.size] / statistics.windows
         l21, l31 = l21 @ weight, l31 @ weight
     residual = triangle[order.size - y.size :, of_y]
-    scaled = l21 / size[:, None]
-    discarded, condition = 0, float(np.linalg.cond(scaled))
+    scaled, discarded = l21 / size[:, None], 0
     if tolerance is None:
+        factor = np.asarray(np.linalg.qr(np.concatenate([scaled, l31]).T, mode="r")).T
+        condition = float(np.linalg.cond(factor[: phi.size, : phi.size]))
         if not condition < 1 / TINY:
             lost = dependent_signal(statistics, phi)
             reason = f"{lost} depends on the regressors before it" if lost else "the instruments do not reach them all"
             raise RankError(f"The regressors are singular on the instruments: {reason}. Use an input with more levels "
                             "and frequencies, fewer block rows or basis functions, or augmented instruments.")
-        factor = np.asarray(np.linalg.qr(np.concatenate([scaled, l31]).T, mode="r")).T
-        r11, r21, r22 = factor[: phi.size, : phi.size], factor[phi.size :, : phi.size], factor[phi.size :, phi.size :]
-        gain = np.linalg.solve(r11.T, r21.T).T
+        r22 = factor[phi.size :, phi.size :]
     else:
-        left, values, right = np.linalg.svd(scaled, full_matrices=True)
+        _, values, right = np.linalg.svd(scaled, full_matrices=True)
         kept = int(np.sum(values > tolerance * values[0]))
+        condition = float(np.linalg.cond(scaled))
         r22, discarded = l31 @ right[kept:].T, phi.size - kept
-        gain = (l31 @ right[:kept].T / values[:kept]) @ left[:, :kept].T
-    return RQ(r22, residual.T, gain / size, condition, discarded, triangle[: z.size, : z.size], (l21, l31))
+    return RQ(r22, residual.T, condition, discarded, triangle[: z.size, : z.size], (l21, l31))

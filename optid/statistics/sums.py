@@ -203,9 +203,8 @@ class Sums(Total):
             return False
         for pair, products in found.items():
             self._products[pair] = self._products.get(pair, 0.0) + products
-        constant = BlockSignals.dense(np.ones((block.valid.size + reach, 1)))
         for total, group in zip(self._totals, block.groups):
-            total += lagged_products(group, constant, range(1), reach)[:, 0, 0]
+            total += group.totals(slice(reach, len(group.weights) - reach))
         self._stretched += block.valid.size
         return True
 

@@ -139,6 +139,8 @@ def _is_pulsed(u: Array) -> bool:
 def hold_last(samples: Array) -> Array:
     """Repeat the last value where samples (N, c) are missing, and the first one before it."""
     filled = np.array(samples, dtype=float)
+    if np.isfinite(filled).all():
+        return filled
     for column in filled.T:
         present = np.isfinite(column)
         if present.any() and not present.all():

@@ -191,13 +191,14 @@ def _projections(statistics: HankelStatistics, regression: RegressionRows, width
     z, phi, y = regression
     blocks, j = rq(statistics, z, phi, y), statistics.windows
     regressors, outputs = (part / np.sqrt(j) for part in blocks.projected)
-    q2 = np.linalg.qr(regressors.T, mode="complete")[0][:, phi.size :]
+    q, r11 = np.linalg.qr(regressors.T, mode="complete")
+    q1, q2 = q[:, : phi.size], q[:, phi.size :]
     r22 = outputs @ q2
     orthonormal = np.sqrt(j) * solve_triangular(blocks.triangle, np.eye(z.size))
     shocks, noise = np.zeros((width, q2.shape[1])), np.zeros((width, y.size))
     shocks[z] = orthonormal @ q2
     noise[y, np.arange(y.size)] = 1
-    noise[phi] -= blocks.gain.T
+    noise[phi] -= solve_triangular(r11[: phi.size], (outputs @ q1).T)
     noise[z] -= orthonormal @ (r22 @ q2.T).T
     size = float(np.sqrt(np.sum(np.diag(statistics.gram)[y] / sizes**2) / j))
     return r22 / sizes[:, None], noise / sizes, shocks, FLOOR * max(r22.shape) * np.finfo(float).eps * size

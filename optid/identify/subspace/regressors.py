@@ -111,7 +111,8 @@ class ObserverForm:
         x = self.expansion
         chunk = min(CHUNK, max(64, HELD // (self.l * self.n * (x.p + 2 * x.q + self.l + 1))))
         starts = range(0, len(run), chunk)
-        state = np.zeros((self.l, len(self._signals(run[:1])), self.n))
+        signals = 1 + x.p + x.q * (2 if self.extra else 1) + (1 + self.l) * self.injected
+        state = np.zeros((self.l, signals, self.n))
         state[:, 0] = self.c  # C_o F^k, the effect of x0
         responses = adjoint_responses(self.a - self.gain @ self.c, self.c, state,
                                       (self._signals(run[start : start + chunk]) for start in starts))
