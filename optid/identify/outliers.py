@@ -7,6 +7,7 @@ signal on a constant one.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import fdtrc, ndtri
@@ -88,15 +89,13 @@ def _may_hold(parts: Sequence[Array]) -> bool:
     An outlier is `FAR` robust standard deviations off the running median, and over `FAR` / `STEP` off a neighbour.
     """
     half, around = WINDOW // 2, np.arange(WINDOW) - WINDOW // 2
-    count = min(min(x.size for x in parts) // 8, SAMPLED[1])
-    if count < SAMPLED[0]:
+    if min(x.size for x in parts) < 8 * SAMPLED[0]:
         return True
 
     def deviations(x: Array, at: np.ndarray) -> Array:
         return np.abs(x[at] - np.partition(x[at[:, None] + around], half, axis=1)[:, half])
 
-    spread = (np.arange(count) * GOLDEN) % 1  # even, and in step with no period of the record
-    some = np.concatenate([deviations(x, half + ((x.size - 2 * half) * spread).astype(int)) for x in parts])
+    some = np.concatenate([deviations(x, _places(x.size)) for x in parts])
     middle = float(np.partition(some, some.size // 2)[some.size // 2])
     least = (1 - CAREFUL / np.sqrt(some.size)) * FAR * middle / NORMAL_MEDIAN
     for x in parts:
@@ -113,6 +112,13 @@ def _may_hold(parts: Sequence[Array]) -> bool:
         if any(np.max(_deviations(end)[: half + LONGEST]) > least for end in ends):
             return True
     return False
+
+
+@lru_cache(maxsize=8)
+def _places(size: int) -> np.ndarray:
+    """Return a sample in eight, up to a limit, of so many: even, and in step with no period of the record."""
+    half, count = WINDOW // 2, min(size // 8, SAMPLED[1])
+    return half + ((size - 2 * half) * ((np.arange(count) * GOLDEN) % 1)).astype(int)
 
 
 def _deviations(x: Array) -> Array:

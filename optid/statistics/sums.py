@@ -176,7 +176,10 @@ class Sums(Total):
             gram[columns, constant] += total
             gram[constant, columns] += total
         gram[constant, constant] += self._stretched
-        return np.triu(gram) + np.triu(gram, 1).T
+        upper = np.triu(gram)
+        whole = upper + upper.T
+        whole.flat[:: len(whole) + 1] /= 2
+        return whole
 
     def _is_small(self, rows: int, products: float) -> bool:
         return rows * self.frame.n**2 <= products

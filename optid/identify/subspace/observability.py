@@ -18,7 +18,7 @@ from optid.identify.subspace.regressors import ObserverForm
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius
-from optid.statistics.expansion import Expansion, check_channels
+from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import complete_runs
 
 WEAK = 0.1  # share of the energy of the feedback that simulated feedback explains, below which a warning is given
@@ -40,9 +40,8 @@ class Windows:
 
     @classmethod
     def of(cls, plan: Plan) -> "Windows":
-        """Return the signals of a plan; too few block rows are a `StructureError`, a constant channel a `DataError`."""
+        """Return the signals of a plan; too few block rows are a `StructureError`."""
         expansion, nx = plan.expansion(), plan.order
-        check_channels(plan.records, plan.data.inputs, plan.data.outputs)
         alpha = (expansion.block_rows(plan.records, nx) if plan.block_rows is None
                  else check_integer(plan.block_rows, "block_rows", 2))
         if nx is not None and alpha <= nx:

@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from optid.arrays import Array
+from optid.bases import Linear
 from optid.errors import DataWarning
-from optid.statistics.expansion import Expansion
+from optid.statistics.expansion import Expansion, check_channels
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import RQ, rq
 
@@ -70,6 +71,10 @@ def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, 
     """
     statistics = hankel_statistics(records, 2 * block_rows, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
+    x = expansion
+    if statistics.method == "qr" or not all(isinstance(basis, Linear) for basis in x.inputs):
+        # where all signals are channels, one that depends on others makes the windows all but singular
+        check_channels([record[:, : x.m + x.l] for record in records], x.input_names, x.output_names)
     statistics.check()
     if statistics.windows < KEPT * statistics.candidates:
         warnings.warn(f"missing samples leave {statistics.windows} of {statistics.candidates} windows of "
