@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.arrays import Array
-from optid.core.constraint import Constraint, ConstraintReader
+from optid.core.constraint import Constraint, read_constraints
 from optid.core.leaves import DENSE, GAUGE, Affine, Leaf, LeafSpace, Product, positions, slices_of
 from optid.core.terms import Errors, Expressed, Squares, Term, Values, flat
 from optid.errors import StructureError, nearest
@@ -148,7 +148,7 @@ class Problem:
     def _shared_with(self, made: "Problem", x: Values, own: int, held: Iterable[Constraint]) -> "Problem":
         """Return a problem made of this one, in whose leaves constraints were read, behind its own first ones."""
         vars(made)["space"] = self.space  # the same leaves of the same usual sizes
-        vars(made)["_at_start"] = (*(made._read(x, set(range(own))) if own else ()),
+        vars(made)["_at_start"] = (*(read_constraints(made, x, range(own)) if own else ()),
                                    *(replace(one, builder=one.builder + own) for one in held))
         return made
 
@@ -279,13 +279,9 @@ class Problem:
                 found[self.space.places[leaf.name], self.slices[name]] = part
         return found
 
-    def _read(self, x: Values, only: set[int] | None = None) -> list[Constraint]:
-        reader = ConstraintReader(self.name, self.space, self.facts, self.has_convex_terms, self.about)
-        return reader.read(self.restrictions, self.builders, x, self.expressions(self.space.variables, x), only)
-
     @cached_property
     def _at_start(self) -> tuple[Constraint, ...]:
-        held = tuple(self._read(self.start)) if self.restrictions or self.builders else ()
+        held = tuple(read_constraints(self, self.start)) if self.restrictions or self.builders else ()
         if self.gauged and any(one.name == GAUGE for one in held):
             raise StructureError(f"there are two constraints named {GAUGE!r}; give each its own name")
         return held
@@ -301,9 +297,9 @@ class Problem:
             return self._at_start
         point = self.pack(x).tobytes()
         if point not in self._read_about:  # the last one alone is kept
-            kept = (one for one in self._at_start if one.builder not in moving)
+            held = [one for one in self._at_start if one.builder not in moving] + read_constraints(self, x, moving)
             self._read_about.clear()
-            self._read_about[point] = tuple(sorted([*kept, *self._read(x, moving)], key=lambda one: one.builder))
+            self._read_about[point] = tuple(sorted(held, key=lambda one: one.builder))
         return self._read_about[point]
 
     @cached_property
