@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from optid.arrays import Array
 from optid.core.constraint import Constraint, read_constraints
-from optid.core.leaves import DENSE, GAUGE, Affine, Leaf, LeafSpace, Product, positions, slices_of
+from optid.core.leaves import DENSE, GAUGE, Affine, Leaf, LeafSpace, Product, joined, positions, slices_of
 from optid.core.terms import Errors, Expressed, Squares, Term, Values, flat
 from optid.errors import StructureError, nearest
 from optid.program.solution import Bound
@@ -264,20 +264,11 @@ class Problem:
 
     def slope(self, x: Values) -> Any:
         """Return the derivative (leaves, unknowns) of all leaves, sparse where it has many entries."""
-        if self.space.size * self.size > DENSE:
-            blocks = {name: {name: sp.eye_array(place.stop - place.start)} for name, place in self.slices.items()}
-            blocks |= {leaf.name: leaf.slope(x) for leaf in self.leaves}
-            sizes = {name: place.stop - place.start for name, place in self.slices.items()}
-            return sp.csr_array(sp.vstack([sp.hstack([
-                parts.get(name, sp.csr_array((self.space.places[leaf].stop - self.space.places[leaf].start, size)))
-                for name, size in sizes.items()]) for leaf in self.space.places for parts in [blocks.get(leaf, {})]]))
-        found = np.zeros((self.space.size, self.size))
-        for name, place in self.slices.items():
-            found[self.space.places[name], place] = np.eye(place.stop - place.start)
-        for leaf in self.leaves:
-            for name, part in leaf.slope(x).items():
-                found[self.space.places[leaf.name], self.slices[name]] = part
-        return found
+        eye: Any = sp.eye_array if self.space.size * self.size > DENSE else np.eye
+        blocks: dict[str, Any] = {name: {name: eye(place.stop - place.start)} for name, place in self.slices.items()}
+        blocks |= {leaf.name: leaf.slope(x) for leaf in self.leaves}
+        return joined([(place.stop - place.start, blocks.get(name, {})) for name, place in self.space.places.items()],
+                      self.slices)
 
     @cached_property
     def _at_start(self) -> tuple[Constraint, ...]:
