@@ -103,7 +103,7 @@ def least_multipliers(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], 
     if any(issparse(row.slope) or row.constraint.cone == "psd" for row in rows):
         return None
     lagrangian = LagrangianAtPoint.of(problem, x)
-    floor = lagrangian.floor()
+    floor = lagrangian.floor(lagrangian.magnitudes)
     columns, equality, parts = active_slopes(lagrangian, rows)
     count = len(problem.gauged)
     places = [(GAUGE, slice(k, k + 1), np.ones(1)) for k in range(count)]
