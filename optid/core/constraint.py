@@ -113,9 +113,10 @@ class Constraint:
                            if one.id in names}, len(self))
 
     def violations(self, g: Array) -> Array:
-        """Return by how much every row is violated where it has the value g (m,); of a matrix one number."""
+        """Return how far every row is violated at the value g (m,); of a matrix one number, NaN where not finite."""
         if self.cone == "psd":
-            return np.array([largest_eigenvalue(g)])
+            finite = np.all(np.isfinite(g))
+            return np.array([max(0.0, float(np.linalg.eigvalsh(symmetric_part(g))[-1])) if finite else np.nan])
         return np.abs(g) if self.is_equality else np.maximum(g, 0.0)
 
     def violation(self, space: LeafSpace, y: Values) -> float:
@@ -130,11 +131,6 @@ def join_by_name(constraints: Sequence[Constraint], parts: Sequence[Array]) -> d
         found.setdefault(one.name, []).append((one.first, part))
     return {name: np.concatenate([part for _, part in sorted(several, key=lambda pair: pair[0])])
             for name, several in found.items()}
-
-
-def largest_eigenvalue(vector: Array) -> float:
-    """Return that of the symmetric part of a square matrix that is flat, not below zero; NaN where an entry is NaN."""
-    return max(0.0, float(np.linalg.eigvalsh(symmetric_part(vector))[-1])) if np.all(np.isfinite(vector)) else np.nan
 
 
 def symmetric_part(vector: Array) -> Array:
