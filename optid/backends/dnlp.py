@@ -36,9 +36,8 @@ class Smooth:
 
     original: cp.Problem  # the problem it was made from
     problem: cp.Problem  # the smooth problem; its constraints are read through ``rows``
-    attributes: CvxAttr2Constr  # the first of the two reductions
-    kinks: Dnlp2Smooth  # the second
-    inverse: tuple[Any, Any]  # their inverse data
+    invert: Callable[[ReducedSolution], ReducedSolution]  # from its solutions to those of the original
+    lowered: bool  # whether attributes of variables were replaced
 
     @cached_property
     def variables(self) -> list[cp.Variable]:
@@ -76,7 +75,7 @@ class Smooth:
     def start(self) -> np.ndarray:
         """Return the flat start: the values the original variables hold now, auxiliary ones consistent with them."""
         known = {variable.id for variable in self.original.variables()}
-        plain = all(variable.id in known for variable in self.variables) and not self.inverse[0]
+        plain = all(variable.id in known for variable in self.variables) and not self.lowered
         current = self if plain else _apply(self.original)
         _set_nlp_initial_point(current.problem)
         return _flat([variable.value for variable in current.variables])
@@ -95,13 +94,9 @@ class Smooth:
         parts = np.split(multipliers, np.cumsum([rows.size for rows in self.rows])[:-1])
         ids = [constraint.id for constraint in self.problem.constraints]
         dual = dict(zip(ids, parts)) if multipliers.size else {}
-        solution = ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})
-        solution = self.attributes.invert(self.kinks.invert(solution, self.inverse[1]), self.inverse[0])
-        values, duals = solution.primal_vars, solution.dual_vars
+        self.original.unpack(self.invert(ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})))
         stated = statement_of(problem)
-        return Answer(status, word, {name: values[v.id] for name, v in stated.variables.items() if v.id in values}, {
-            name: np.concatenate([np.ravel(duals[member.id], order="F") for member in group] or [np.zeros(0)])
-            for name, group in stated.constraints.items() if all(member.id in duals for member in group)}, **figures)
+        return Answer(status, word, stated.values(), stated.duals(), **figures)
 
 
 def smooth(problem: cp.Problem) -> Smooth:
@@ -161,7 +156,8 @@ def _apply(problem: cp.Problem) -> Smooth:
             reduced = inverse[0][variable.id]
             reduced.value = np.reshape(lower_value(variable), reduced.shape, order="F")
     result, inverse_kinks = kinks.apply(lowered)
-    return Smooth(problem, result, attributes, kinks, (inverse, inverse_kinks))
+    return Smooth(problem, result, lambda one: attributes.invert(kinks.invert(one, inverse_kinks), inverse),
+                  bool(inverse))
 
 
 class _SmoothChain(Dnlp2Smooth):
