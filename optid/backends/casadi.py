@@ -78,10 +78,10 @@ def _translator(leaves: Mapping[int, Any]) -> Callable[[Any], Any]:
     def column(expr: Any) -> Any:
         """Translate an expression, each once; it is kept, so that its id stays its own."""
         if id(expr) not in done:
-            done[id(expr)] = (expr, made(expr))
+            done[id(expr)] = (expr, make(expr))
         return done[id(expr)][1]
 
-    def made(expr: Any) -> Any:
+    def make(expr: Any) -> Any:
         if isinstance(expr, cp.Variable):
             return leaves[expr.id]
         if expr.is_constant():

@@ -217,7 +217,7 @@ class LeafSpace(OwnNumbers):
 
     def rows(self, parts: Mapping[str, Any], count: int) -> Any:
         """Return slopes by some leaves as rows (count, leaves), sparse where there are many entries."""
-        return joined([(count, parts)], self.places)
+        return in_places([(count, parts)], self.places)
 
     def vector(self, y: Values) -> Array:
         """Return values one after another."""
@@ -230,7 +230,7 @@ def variable_size(value: Array, usual: float | None = None) -> float:
     return max(size, usual) if usual is not None else size if size > ZERO else 1.0
 
 
-def joined(blocks: Sequence[tuple[int, Mapping[str, Any]]], places: Mapping[str, slice]) -> Any:
+def in_places(blocks: Sequence[tuple[int, Mapping[str, Any]]], places: Mapping[str, slice]) -> Any:
     """Return blocks (rows, their parts by name) as one matrix, each part in its place; sparse with many entries."""
     height, width = sum(count for count, _ in blocks), sum(place.stop - place.start for place in places.values())
     if height * width > DENSE:

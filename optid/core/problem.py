@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from optid.arrays import Array
 from optid.core.constraint import Constraint, read_constraints
-from optid.core.leaves import DENSE, GAUGE, Affine, Leaf, LeafSpace, Product, joined, positions, slices_of
+from optid.core.leaves import DENSE, GAUGE, Affine, Leaf, LeafSpace, Product, in_places, positions, slices_of
 from optid.core.terms import Errors, Expressed, Squares, Term, Values, flat
 from optid.errors import StructureError, nearest
 from optid.program.solution import Bound
@@ -267,8 +267,8 @@ class Problem:
         eye: Any = sp.eye_array if self.space.size * self.size > DENSE else np.eye
         blocks: dict[str, Any] = {name: {name: eye(place.stop - place.start)} for name, place in self.slices.items()}
         blocks |= {leaf.name: leaf.slope(x) for leaf in self.leaves}
-        return joined([(place.stop - place.start, blocks.get(name, {})) for name, place in self.space.places.items()],
-                      self.slices)
+        places = self.space.places.items()
+        return in_places([(place.stop - place.start, blocks.get(name, {})) for name, place in places], self.slices)
 
     @cached_property
     def _at_start(self) -> tuple[Constraint, ...]:
