@@ -34,7 +34,7 @@ from formulations.constraints.rule import Rule
 from optid.bases import Bases
 from optid.core.leaves import Product
 from optid.core.problem import Problem
-from optid.core.terms import Inner, Length, Squares
+from optid.core.terms import Expressed, Length, Squares
 from optid.data.record import Data
 from optid.identify.subspace.procedure import SubspaceSteps, subspace_steps
 from optid.identify.subspace.realisation import Realisation
@@ -79,7 +79,7 @@ def _centre(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Problem:
                            if isinstance(one, PSD) else one for rule in rules for one in rule.members(view)]}
 
     return Problem(
-        "centre", {"P": np.eye(len(a)), "margin": np.zeros(())}, (Inner({"margin": np.array(-1.0)}),),
+        "centre", {"P": np.eye(len(a)), "margin": np.zeros(())}, (Expressed(lambda v: -v["margin"]),),
         further=lambda variables, _: {"Q": inner @ variables["P"]}, facts={"reference": {"A": step.free}},
         restrictions=(_normalised, ease), symmetric=frozenset({"P"}))
 

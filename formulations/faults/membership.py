@@ -19,7 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.core.problem import Problem
-from optid.core.terms import Inner
+from optid.core.terms import Expressed
 from optid.data.record import Data
 from optid.faults.consistency.bounded_noise import SIGMAS, BoundedWindow, bounded_window
 from optid.faults.consistency.candidate_tests import judge_candidates, prove_factor
@@ -94,6 +94,6 @@ def _problem(window: BoundedWindow, signature: Any = None) -> Problem:
         return prove_factor(window, signature, weights, problem, values), None
 
     return Problem(
-        "fault.membership", start, (Inner({"t": np.array(1.0)}),),
+        "fault.membership", start, (Expressed(lambda v: v["t"]),),
         further=lambda v, _: {"x": cp.reshape(v["states"], (count, n), order="C")}, restrictions=(possible,),
         proof=proof)

@@ -26,7 +26,7 @@ import numpy as np
 
 from optid.bases import Triangular
 from optid.core.problem import Problem
-from optid.core.terms import Inner, Squares, Values
+from optid.core.terms import Expressed, Squares, Values
 from optid.faults.repair.allocation import Allocation
 from optid.program.view import View
 
@@ -94,7 +94,7 @@ def _posed(name: str, problem: Allocation, start: Values, free: str, reference: 
     terms = (costs[0], effort)
     if len(costs) > 1:
         start = {**start, "worst": np.array(max(cost.value(start) for cost in costs))}
-        terms = (Inner({"worst": np.array(1.0)}), effort)
+        terms = (Expressed(lambda v: v["worst"]), effort)
     rest = problem.members[0].rest_output(np.append(problem.v_middle, np.zeros(len(problem.feedback))))
     return Problem(name, start, terms, model=lambda values: values["v"],
                    facts={"channels": problem.names, "outputs": problem.model.outputs}, restrictions=(equations,),

@@ -9,7 +9,7 @@ infeasible programme, bonmin returns no multipliers, the sqpmethod variants stay
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from operator import mul
 from typing import Any
@@ -41,29 +41,16 @@ STATUS = {
 
 
 def translate(form: Smooth) -> dict[str, Any]:
-    """Translate a programme after CVXPY's smooth chain into CasADi's dictionary ``{"x", "p", "f", "g"}``.
+    """Translate a programme after CVXPY's smooth chain into CasADi's dictionary ``{"x", "f", "g"}``.
 
     Raises:
         StructureError: an atom without a translation, by name.
     """
-    x = ca.MX.sym("x", sum(v.size for v in form.variables))
-    parameters = form.problem.parameters()
-    p = ca.MX.sym("p", sum(v.size for v in parameters))
-    known: dict[int, Any] = {}
-    for vector, leaves in ((x, form.variables), (p, parameters)):
-        edges = np.concatenate([[0], np.cumsum([leaf.size for leaf in leaves])]).astype(int).tolist()
-        known.update({leaf.id: part for leaf, part in zip(leaves, ca.vertsplit(vector, edges))})
-    done: dict[int, tuple[Any, Any]] = {}
-
-    def column(expr: Any) -> Any:
-        """Translate an expression, each once; it is kept, so that its id stays its own."""
-        if id(expr) not in done:
-            done[id(expr)] = (expr, _column(expr, known, column))
-        return done[id(expr)][1]
-
-    rows = [ca.densify(column(one)) for one in form.rows]
-    return {"x": x, "p": p, "f": ca.densify(column(form.problem.objective.expr)),
-            "g": ca.vertcat(*rows) if rows else ca.MX(0, 1)}
+    edges = np.cumsum([0, *(v.size for v in form.variables)]).tolist()
+    x = ca.MX.sym("x", edges[-1])
+    column = _translator({v.id: part for v, part in zip(form.variables, ca.vertsplit(x, edges))})
+    rows = [column(one) for one in form.rows]
+    return {"x": x, "f": column(form.problem.objective.expr), "g": ca.vertcat(*rows) if rows else ca.MX(0, 1)}
 
 
 def function_of(groups: Sequence[Sequence[cp.Variable]], results: Sequence[Sequence[Any]]) -> Any:
@@ -77,27 +64,36 @@ def function_of(groups: Sequence[Sequence[cp.Variable]], results: Sequence[Seque
         StructureError: an atom without a translation, by name.
     """
     arguments = [ca.MX.sym(f"v{i}", len(group)) for i, group in enumerate(groups)]
-    known = {leaf.id: vector[i] for group, vector in zip(groups, arguments) for i, leaf in enumerate(group)}
-
-    def column(expr: Any) -> Any:
-        return _column(expr, known, column)
-
-    rows = [ca.vertcat(*(ca.densify(column(cp.Constant(one) if np.isscalar(one) else one)) for one in result))
+    column = _translator({leaf.id: vector[i] for group, vector in zip(groups, arguments)
+                          for i, leaf in enumerate(group)})
+    rows = [ca.vertcat(*(column(cp.Constant(one) if np.isscalar(one) else one) for one in result))
             for result in results]
     return ca.Function("equations", arguments, rows).expand()
 
 
-def _column(expr: Any, leaves: dict[int, Any], column: Callable[[Any], Any]) -> Any:
-    if isinstance(expr, cp.Variable | cp.Parameter):
-        return leaves[expr.id]
-    if expr.is_constant() and not expr.parameters():
-        return constant(expr.value, (int(expr.size), 1))
-    name, columns = type(expr).__name__, [column(arg) for arg in expr.args]
-    if name in MOVES:
-        return _move(expr, columns)
-    if name not in ATOMS:
-        raise StructureError(f"the atom {name} in {expr} has no translation for CasADi's solvers")
-    return ATOMS[name](expr, columns)
+def _translator(leaves: Mapping[int, Any]) -> Callable[[Any], Any]:
+    """Return what makes a dense column of an expression, from the columns of variables by their ids."""
+    done: dict[int, tuple[Any, Any]] = {}
+
+    def column(expr: Any) -> Any:
+        """Translate an expression, each once; it is kept, so that its id stays its own."""
+        if id(expr) not in done:
+            done[id(expr)] = (expr, make(expr))
+        return done[id(expr)][1]
+
+    def make(expr: Any) -> Any:
+        if isinstance(expr, cp.Variable):
+            return leaves[expr.id]
+        if expr.is_constant():
+            return constant(expr.value, (int(expr.size), 1))
+        name, columns = type(expr).__name__, [column(arg) for arg in expr.args]
+        if name in MOVES:
+            return _move(expr, columns)
+        if name not in ATOMS:
+            raise StructureError(f"the atom {name} in {expr} has no translation for CasADi's solvers")
+        return ATOMS[name](expr, columns)
+
+    return lambda expr: ca.densify(column(expr))
 
 
 def constant(value: Any, shape: tuple[int, int]) -> Any:
@@ -200,24 +196,27 @@ ATOMS: dict[str, Callable[[Any, list], Any]] = {
 }
 
 
-def options(name: str, settings: Settings) -> dict[str, Any]:
+def options(name: str, problem: Problem, settings: Settings) -> dict[str, Any]:
     """Translate what is asked into options of "ipopt" or "fatrop"; native options of the user come last.
 
     Raises:
         StructureError: a Hessian that is not exact.
     """
-    eps, limit = settings.accuracy, settings.time_limit
-    loud = settings.verbose
-    chosen: dict[str, Any] = {"print_time": loud, "show_eval_warnings": loud, "error_on_fail": False}
+    eps, loud = settings.accuracy, settings.verbose
+    chosen: dict[str, Any] = {"tol": eps, "max_iter": LIMIT, "print_level": 5 if loud else 0}
     if name == "ipopt":
-        chosen |= {"ipopt.tol": eps, "ipopt.constr_viol_tol": eps, "ipopt.compl_inf_tol": eps,
-                   "ipopt.acceptable_iter": 0, "ipopt.bound_relax_factor": 0.1 * eps, "ipopt.max_iter": LIMIT,
-                   "ipopt.print_level": 5 if loud else 0, "ipopt.sb": "yes"}
-        if limit is not None:
-            chosen["ipopt.max_wall_time"] = float(limit)
-    if name == "fatrop":
-        chosen |= {"fatrop.tol": eps, "fatrop.max_iter": LIMIT, "fatrop.print_level": 5 if loud else 0}
-    chosen.update({key if "." in key else f"{name}.{key}": value for key, value in settings.options.items()})
+        chosen |= {"constr_viol_tol": eps, "compl_inf_tol": eps, "acceptable_iter": 0, "bound_relax_factor": 0.1 * eps,
+                   "sb": "yes"}
+        if settings.time_limit is not None:
+            chosen["max_wall_time"] = float(settings.time_limit)
+        if 0 < problem.scale < 1:  # its tolerances are absolute: outputs of 1e-3 would all be met
+            chosen["obj_scaling_factor"] = 1.0 / problem.scale
+        if problem.settled and settings.warm:  # a large barrier would throw away the start
+            chosen["mu_init"] = 1e-6
+        if problem.courses and not problem.settled:
+            chosen["max_iter"] = FAR
+    chosen = {key if "." in key else f"{name}.{key}": value for key, value in {**chosen, **settings.options}.items()}
+    chosen = {"print_time": loud, "show_eval_warnings": loud, "error_on_fail": False} | chosen
     if chosen.get("ipopt.hessian_approximation", "exact") != "exact":
         raise StructureError("ipopt with a limited-memory Hessian does not converge on these programmes; "
                              "leave hessian_approximation at 'exact'")
@@ -227,26 +226,18 @@ def options(name: str, settings: Settings) -> dict[str, Any]:
 def solve_with(name: str, problem: Problem, settings: Settings) -> Answer:
     """Solve an LP, QP or smooth nonconvex programme with "ipopt" or "fatrop".
 
-    The translated programme and the compiled solver are kept with the CVXPY problem: only parameter values and the
-    start are new in the next solve. Multipliers are in CVXPY's convention ``L = f + dual (lhs - rhs)``.
+    The translated programme and the compiled solver are kept with the CVXPY problem: only the start is new in the next
+    solve. Multipliers are in CVXPY's convention ``L = f + dual (lhs - rhs)``.
     """
     clock = time.perf_counter()
     posed = statement_of(problem).problem
-    form = smooth(posed)
-    chosen = options(name, settings)
-    if name == "ipopt" and 0 < problem.scale < 1:  # its tolerances are absolute: outputs of 1e-3 would all be met
-        chosen = {"ipopt.obj_scaling_factor": 1.0 / problem.scale} | chosen
-    if name == "ipopt" and problem.settled and settings.warm:  # a large barrier would throw away the start
-        chosen = {"ipopt.mu_init": 1e-6} | chosen
-    if name == "ipopt" and problem.courses and not problem.settled and chosen["ipopt.max_iter"] == LIMIT:
-        chosen["ipopt.max_iter"] = FAR
+    form, chosen = smooth(posed), options(name, problem, settings)
     graph = get_or_make(posed, "casadi", lambda: translate(form))
     solver = get_or_make(posed, (name, repr(sorted(chosen.items()))),
                          lambda: ca.nlpsol("solver", name, graph, chosen))
     compiling = time.perf_counter() - clock
-    lower, upper = form.bounds
-    row_lower, row_upper = form.row_bounds
-    found = solver(x0=form.start(), p=form.parameter_values(), lbx=lower, ubx=upper, lbg=row_lower, ubg=row_upper)
+    (lower, upper), (row_lower, row_upper) = form.bounds, form.row_bounds
+    found = solver(x0=form.start(), lbx=lower, ubx=upper, lbg=row_lower, ubg=row_upper)
     statistics = solver.stats()
     word, status = _status(statistics)
     return form.answer(problem, status, word, np.asarray(found["x"]), np.asarray(found["lam_g"]),

@@ -14,7 +14,6 @@ import cvxpy as cp
 import numpy as np
 from cvxpy.atoms.affine.binary_operators import DivExpression
 from cvxpy.atoms.quad_over_lin import quad_over_lin
-from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.zero import Zero
 from cvxpy.reductions.cvx_attr2constr import CvxAttr2Constr, lower_value
 from cvxpy.reductions.dnlp2smooth.dnlp2smooth import Dnlp2Smooth
@@ -33,13 +32,12 @@ CACHE = "optid"  # our entry in the problem's own cache of compiled solvers
 
 @dataclass(frozen=True)
 class Smooth:
-    """A programme after CVXPY's smooth chain, with the way back."""
+    """A programme after CVXPY's smooth chain, with the way back; parameters are constants."""
 
     original: cp.Problem  # the problem it was made from
     problem: cp.Problem  # the smooth problem; its constraints are read through ``rows``
-    attributes: CvxAttr2Constr  # the first of the two reductions
-    kinks: Dnlp2Smooth  # the second
-    inverse: tuple[Any, Any]  # their inverse data
+    invert: Callable[[ReducedSolution], ReducedSolution]  # from its solutions to those of the original
+    lowered: bool  # whether attributes of variables were replaced
 
     @cached_property
     def variables(self) -> list[cp.Variable]:
@@ -52,7 +50,14 @@ class Smooth:
 
         Their multipliers, in the convention ``L = f + dual * row``, are CVXPY's own dual values.
         """
-        return [_rows(constraint) for constraint in self.problem.constraints]
+        found = []
+        for constraint in self.problem.constraints:
+            if (expression := rows_of(constraint)) is None:
+                raise StructureError(
+                    f"{constraint} is a {type(constraint).__name__} constraint, which no NLP solver here accepts; "
+                    "write it with equalities and inequalities (a second-order cone as norm(x) <= t)")
+            found.append(expression)
+        return found
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -70,15 +75,10 @@ class Smooth:
     def start(self) -> np.ndarray:
         """Return the flat start: the values the original variables hold now, auxiliary ones consistent with them."""
         known = {variable.id for variable in self.original.variables()}
-        plain = all(variable.id in known for variable in self.variables) and not self.inverse[0]
+        plain = all(variable.id in known for variable in self.variables) and not self.lowered
         current = self if plain else _apply(self.original)
         _set_nlp_initial_point(current.problem)
         return _flat([variable.value for variable in current.variables])
-
-    def parameter_values(self) -> np.ndarray:
-        """Return the flat vector of the values the parameters hold now."""
-        self.attributes.update_parameters(self.original)
-        return _flat([parameter.value for parameter in self.problem.parameters()])
 
     def answer(self, problem: Problem, status: Status, word: str, x: Any, multipliers: Any, **figures: Any) -> Answer:
         """Return a solver's claim about a programme, whose problem this is, with point and multipliers where usable.
@@ -94,13 +94,9 @@ class Smooth:
         parts = np.split(multipliers, np.cumsum([rows.size for rows in self.rows])[:-1])
         ids = [constraint.id for constraint in self.problem.constraints]
         dual = dict(zip(ids, parts)) if multipliers.size else {}
-        solution = ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})
-        solution = self.attributes.invert(self.kinks.invert(solution, self.inverse[1]), self.inverse[0])
-        values, duals = solution.primal_vars, solution.dual_vars
+        self.original.unpack(self.invert(ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})))
         stated = statement_of(problem)
-        return Answer(status, word, {name: values[v.id] for name, v in stated.variables.items() if v.id in values}, {
-            name: np.concatenate([np.ravel(duals[member.id], order="F") for member in group] or [np.zeros(0)])
-            for name, group in stated.constraints.items() if all(member.id in duals for member in group)}, **figures)
+        return Answer(status, word, stated.values(), stated.duals(), **figures)
 
 
 def smooth(problem: cp.Problem) -> Smooth:
@@ -127,7 +123,7 @@ class Derivatives:
     `at`, which evaluates first where the point is a new one.
 
     Attributes:
-        jacobian_pattern, hessian_pattern: (rows, columns) of the non-zeros, of the Hessian in the lower triangle.
+        engine: it, compiled once for a problem.
         value: the objective at the last point.
         rows: the rows there.
     """
@@ -135,42 +131,33 @@ class Derivatives:
     def __init__(self, form: Smooth) -> None:
         from cvxpy.reductions.solvers.nlp_solvers.nlp_solver import Oracles
 
-        self._problem = cp.Problem(form.problem.objective, [Zero(rows) for rows in form.rows])
-        self._oracles = Oracles(self._problem, verbose=False)
+        self.engine: Any = get_or_make(form.original, "derivatives", lambda: Oracles(
+            cp.Problem(form.problem.objective, [Zero(rows) for rows in form.rows]), verbose=False))
         self._x: np.ndarray | None = None
         self.rows = np.zeros(sum(rows.size for rows in form.rows))
-        self.jacobian_pattern = self._oracles.jacobianstructure()
-        self.hessian_pattern = self._oracles.hessianstructure()
-
-    @classmethod
-    def of(cls, form: Smooth) -> "Derivatives":
-        """Return the compiled derivatives of a smooth problem, made once, at the values the parameters hold now."""
-        found = get_or_make(form.original, "derivatives", lambda: cls(form))
-        if found._problem.parameters():
-            found._oracles.update_params(found._problem)
-        found._x = None
-        return found
 
     def at(self, x: Any) -> Any:
         """Return the engine at a point: its gradient(x), jacobian(x) and hessian(x, multipliers, factor)."""
         if self._x is None or not np.array_equal(x, self._x):
             self._x = np.array(x, dtype=float)
-            self.value = float(self._oracles.objective(self._x))
+            self.value = float(self.engine.objective(self._x))
             if self.rows.size:
-                self.rows = np.array(self._oracles.constraints(self._x))
-        return self._oracles
+                self.rows = np.array(self.engine.constraints(self._x))
+        return self.engine
 
 
 def _apply(problem: cp.Problem) -> Smooth:
     _set_nlp_initial_point(problem)
     attributes, kinks = CvxAttr2Constr(reduce_bounds=False), _SmoothChain()
     lowered, inverse = attributes.apply(problem)
+    attributes.update_parameters(problem)
     for variable in problem.variables():  # the reduced symmetric variable does not inherit its start
         if inverse and variable in attributes._symmetric_vars:
             reduced = inverse[0][variable.id]
             reduced.value = np.reshape(lower_value(variable), reduced.shape, order="F")
     result, inverse_kinks = kinks.apply(lowered)
-    return Smooth(problem, result, attributes, kinks, (inverse, inverse_kinks))
+    return Smooth(problem, result, lambda one: attributes.invert(kinks.invert(one, inverse_kinks), inverse),
+                  bool(inverse))
 
 
 class _SmoothChain(Dnlp2Smooth):
@@ -180,7 +167,6 @@ class _SmoothChain(Dnlp2Smooth):
       infeasible. It is smooth as it stands.
     * ``quad_over_lin`` along an axis: CVXPY sums over everything.
     * ``log_sum_exp``: CVXPY starts its value at that of the first entry alone.
-    * ``quad_over_lin``, ``rel_entr`` and ``kl_div`` with a parameter: CVXPY freezes its value of the first solve.
     """
 
     def __init__(self) -> None:
@@ -197,29 +183,14 @@ class _SmoothChain(Dnlp2Smooth):
                         f"{expr} along an axis with a variable denominator: write the columns one by one")
                 return originals[quad_over_lin](expr, args)
             total = cp.sum(cp.power(args[0], 2), axis=expr.axis, keepdims=expr.keepdims)
-            unit = args[1].is_constant() and not args[1].parameters() and np.all(args[1].value == 1)
-            return (total if unit else total / args[1]), []
+            return (total if np.all(args[1].value == 1) else total / args[1]), []
 
         def level(expr: cp.Expression, args: list) -> tuple[Any, list]:
             found, constraints = originals[cp.log_sum_exp](expr, args)
             found.value = expr.copy(args).value
             return found, constraints
 
-        def entropy(expr: cp.Expression, args: list) -> tuple[Any, list]:
-            if expr.parameters():
-                raise StructureError(f"{expr}: a parameter inside a relative entropy is not supported; use a constant")
-            return originals[type(expr)](expr, args)
-
-        self.smooth_canon_methods = {**originals, DivExpression: divide, quad_over_lin: squares,
-                                     cp.log_sum_exp: level, cp.rel_entr: entropy, cp.kl_div: entropy}
-
-
-def _rows(constraint: Constraint) -> cp.Expression:
-    if (expression := rows_of(constraint)) is not None:
-        return expression
-    raise StructureError(
-        f"{constraint} is a {type(constraint).__name__} constraint, which no NLP solver here accepts; "
-        "write it with equalities and inequalities (a second-order cone as norm(x) <= t)")
+        self.smooth_canon_methods = {**originals, DivExpression: divide, quad_over_lin: squares, cp.log_sum_exp: level}
 
 
 def _flat(arrays: list) -> np.ndarray:

@@ -62,8 +62,7 @@ def options(settings: Settings) -> dict[str, Any]:
 
 
 def _model(unopy: Any, form: Smooth) -> Any:
-    start, _ = form.start(), form.parameter_values()
-    engine = Derivatives.of(form)
+    start, engine = form.start(), Derivatives(form)
     model = unopy.Model(unopy.PROBLEM_NONLINEAR, start.size, *form.bounds, unopy.ZERO_BASED_INDEXING)
 
     def objective(x: Any) -> float:
@@ -83,10 +82,10 @@ def _model(unopy: Any, form: Smooth) -> Any:
     model.set_objective(unopy.MINIMIZE, objective, partial(derivative, kind="gradient"))
     row_lower, row_upper = form.row_bounds
     if row_lower.size:
-        row, column = engine.jacobian_pattern
+        row, column = engine.engine.jacobianstructure()
         model.set_constraints(row_lower.size, rows, row_lower, row_upper, len(row), row, column,
                               partial(derivative, kind="jacobian"))
-    row, column = engine.hessian_pattern
+    row, column = engine.engine.hessianstructure()
     model.set_lagrangian_hessian(len(row), unopy.LOWER_TRIANGLE, row, column, hessian)
     model.set_lagrangian_sign_convention(unopy.MULTIPLIER_POSITIVE)
     model.set_initial_primal_iterate(start)

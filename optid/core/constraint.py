@@ -6,7 +6,7 @@ another. What is not affine in the leaves stays a CVXPY constraint and is measur
 values of an iterate is *moving*: it is read again at every iterate.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -49,8 +49,8 @@ class Constraint:
     cone: str
     rows: Any
     right: Array
-    moving: bool
-    builder: int
+    moving: bool = False
+    builder: int = 0
     first: int = 0
     expression: Any = None
 
@@ -113,9 +113,10 @@ class Constraint:
                            if one.id in names}, len(self))
 
     def violations(self, g: Array) -> Array:
-        """Return by how much every row is violated where it has the value g (m,); of a matrix one number."""
+        """Return how far every row is violated at the value g (m,); of a matrix one number, NaN where not finite."""
         if self.cone == "psd":
-            return np.array([largest_eigenvalue(g)])
+            finite = np.all(np.isfinite(g))
+            return np.array([max(0.0, float(np.linalg.eigvalsh(symmetric_part(g))[-1])) if finite else np.nan])
         return np.abs(g) if self.is_equality else np.maximum(g, 0.0)
 
     def violation(self, space: LeafSpace, y: Values) -> float:
@@ -130,11 +131,6 @@ def join_by_name(constraints: Sequence[Constraint], parts: Sequence[Array]) -> d
         found.setdefault(one.name, []).append((one.first, part))
     return {name: np.concatenate([part for _, part in sorted(several, key=lambda pair: pair[0])])
             for name, several in found.items()}
-
-
-def largest_eigenvalue(vector: Array) -> float:
-    """Return that of the symmetric part of a square matrix that is flat, not below zero; NaN where an entry is NaN."""
-    return max(0.0, float(np.linalg.eigvalsh(symmetric_part(vector))[-1])) if np.all(np.isfinite(vector)) else np.nan
 
 
 def symmetric_part(vector: Array) -> Array:
@@ -159,92 +155,69 @@ class Reference(dict[str, Array]):
         return super().get(key, default)
 
 
-@dataclass(frozen=True, eq=False)
-class ConstraintReader:
-    """Reads builders in the words of one problem.
+def read_constraints(problem: Any, x: Values, only: Collection[int] | None = None) -> list[Constraint]:
+    """Read the builders of a problem, its own before those of the user, about a point; all or some by their positions.
 
-    Attributes:
-        problem: its name, for messages.
-        space: its leaves.
-        facts: keyword arguments of the `View`.
-        convex: whether a constraint of the user that is not convex is refused; not where one of the formulation is not.
-        about: names of further expressions that depend on the point about which constraints are read.
+    Raises:
+        StructureError: an unknown variable, a name used twice, a constraint that is not convex but has to be.
     """
+    own, reference = len(problem.restrictions), Reference(problem.facts.get("reference", x))
+    view = View(problem.expressions(problem.space.variables, x), **{**problem.facts, "reference": reference})
+    found: list[Constraint] = []
+    convex = problem.has_convex_terms
+    for number, builder in enumerate((*problem.restrictions, *problem.builders)):
+        if only is not None and number not in only:
+            continue
+        reference.asked = False
+        default = getattr(builder, "name", None) or f"constraint {number - own + 1}"
+        built = name_limits(builder(view) if callable(builder) else builder, default)
+        moving = view.was_asked(problem.about) or reference.asked and "reference" not in problem.facts
+        for name, limits in built.items():
+            if any(one.name == name and one.builder != number for one in found):
+                raise StructureError(f"there are two constraints named {name!r}; give each its own name")
+            first = 0
+            for limit in limits:
+                if not limit.member.size:  # a straight line has no curvature
+                    continue
+                one = replace(_read(problem, view, name, limit, number < own), moving=moving, builder=number,
+                              first=first)
+                if number < own:
+                    convex = convex and (one.cone != "other" or limit.member.is_dcp())
+                elif convex:
+                    one.refuse_nonconvex(problem.name)
+                found.append(one)
+                first += len(one)
+    return found
 
-    problem: str
-    space: LeafSpace
-    facts: Mapping[str, Any]
-    convex: bool
-    about: frozenset[str] = frozenset()
 
-    def read(self, own: Sequence[Any], builders: Sequence[Any], about: Values, shown: Mapping[str, Any],
-             only: set[int] | None = None) -> list[Constraint]:
-        """Read builders about a point, all or some by their positions.
+def _read(problem: Any, view: View, name: str, limit: Limit, own: bool) -> Constraint:
+    """Return one member as rows on the leaves, where it is affine in them.
 
-        Args:
-            own: those of the formulation.
-            builders: those of the user: callables of the `View`, or what they would return.
-            about: the reference, where the facts have none.
-            shown: the expressions that they may use.
-            only: positions, among both.
-
-        Raises:
-            StructureError: an unknown variable, a name used twice, a constraint that is not convex but has to be.
-        """
-        reference = Reference(self.facts.get("reference", about))
-        view = View(shown, **{**self.facts, "reference": reference})
-        found: list[Constraint] = []
-        convex = self.convex
-        for number, builder in enumerate((*own, *builders)):
-            if only is not None and number not in only:
-                continue
-            reference.asked = False
-            default = getattr(builder, "name", None) or f"constraint {number - len(own) + 1}"
-            built = name_limits(builder(view) if callable(builder) else builder, default)
-            moving = view.was_asked(self.about) or reference.asked and "reference" not in self.facts
-            for name, limits in built.items():
-                if any(one.name == name and one.builder != number for one in found):
-                    raise StructureError(f"there are two constraints named {name!r}; give each its own name")
-                first = 0
-                for limit in limits:
-                    if not limit.member.size:  # a straight line has no curvature
-                        continue
-                    one = replace(self._rows(view, name, limit, moving, number, number < len(own)), first=first)
-                    if number < len(own):
-                        convex = convex and (one.cone != "other" or limit.member.is_dcp())
-                    elif convex:
-                        one.refuse_nonconvex(self.problem)
-                    found.append(one)
-                    first += len(one)
-        return found
-
-    def _rows(self, view: View, name: str, limit: Limit, moving: bool, number: int, own: bool) -> Constraint:
-        """Return one member as rows on the leaves, where it is affine in them.
-
-        Those of the user are divided by their sizes; those of the formulation stay as it has written them.
-        """
-        member, leaves = limit.member, {variable.id: leaf for leaf, variable in self.space.variables.items()}
-        foreign = sorted({v.name() for v in member.variables() if v.id not in leaves and not view.owns(v)})
-        if foreign:
-            raise StructureError(f"constraint {name!r} uses {', '.join(foreign)}, which is not a variable of "
-                                 f"{self.problem!r} ({', '.join(self.space.variables)})")
-        expression, cone = _in_cone(member)
-        parts = None if expression is None else affine_parts(expression)
-        if parts is None or any(variable.id not in leaves for variable in parts[0]):
-            count = sum(dual.size for dual in member.dual_variables)
-            if expression is not None and cone != "psd" and not own:
-                usual = {self.space.variables[leaf].id: size for leaf, size in self.space.usual_sizes.items()}
-                limit = replace(limit, sizes=row_sizes(expression, usual))
-            return Constraint(name, limit, "other", self.space.rows({}, count), np.zeros(count), moving, number,
-                              expression=expression if cone != "psd" else None)
-        rows, right = self.space.rows({leaves[variable.id]: part for variable, part in parts[0].items()},
-                                      parts[1].size), -parts[1]
-        if cone == "psd" or own:
-            return Constraint(name, limit, cone, rows, right, moving, number)
-        sizes = abs(rows) @ self.space.entry_sizes  # no solver sees the units in which a row was written
-        sizes = np.where(sizes > NEGLIGIBLE * np.abs(right), sizes, 1.0)
-        rows = rows / sizes[:, None] if isinstance(rows, np.ndarray) else sp.diags_array(1 / sizes) @ rows
-        return Constraint(name, replace(limit, sizes=sizes), cone, rows, right / sizes, moving, number)
+    Those of the user are divided by their sizes; those of the formulation stay as it has written them.
+    """
+    member, space = limit.member, problem.space
+    leaves = {variable.id: leaf for leaf, variable in space.variables.items()}
+    foreign = sorted({v.name() for v in member.variables() if v.id not in leaves and not view.owns(v)})
+    if foreign:
+        raise StructureError(f"constraint {name!r} uses {', '.join(foreign)}, which is not a variable of "
+                             f"{problem.name!r} ({', '.join(space.variables)})")
+    expression, cone = _in_cone(member)
+    parts = None if expression is None else affine_parts(expression)
+    if parts is None or any(variable.id not in leaves for variable in parts[0]):
+        count = sum(dual.size for dual in member.dual_variables)
+        if expression is not None and cone != "psd" and not own:
+            limit = replace(limit, sizes=row_sizes(expression, {
+                space.variables[leaf].id: size for leaf, size in space.usual_sizes.items()}))
+        return Constraint(name, limit, "other", space.rows({}, count), np.zeros(count),
+                          expression=expression if cone != "psd" else None)
+    rows, right = space.rows({leaves[variable.id]: part for variable, part in parts[0].items()}, parts[1].size
+                             ), -parts[1]
+    if cone == "psd" or own:
+        return Constraint(name, limit, cone, rows, right)
+    sizes = abs(rows) @ space.entry_sizes  # no solver sees the units in which a row was written
+    sizes = np.where(sizes > NEGLIGIBLE * np.abs(right), sizes, 1.0)
+    rows = rows / sizes[:, None] if isinstance(rows, np.ndarray) else sp.diags_array(1 / sizes) @ rows
+    return Constraint(name, replace(limit, sizes=sizes), cone, rows, right / sizes)
 
 
 def _in_cone(member: Member) -> tuple[Any, str]:

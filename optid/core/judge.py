@@ -91,8 +91,7 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
     """
     if not all(np.all(np.isfinite(x[name])) for name in problem.start):
         return Judgement(np.nan, Residuals(np.inf, "", np.inf, np.inf), {}, False, np.zeros(len(problem.gauged)))
-    rows = rows_at(problem, x)
-    amounts = []
+    rows, lagrangian, amounts = rows_at(problem, x), LagrangianAtPoint.of(problem, x), []
     for product in problem.gauged:
         level, parts = product.level(x)
         amounts.append((abs(level) / (1.0 + sum(float(np.sum(np.abs(flat(x[name])))) for name in parts)), "gauge"))
@@ -100,11 +99,10 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
         amount = float(np.max(np.abs(x[name] - x[name].T), initial=0.0)) / (1.0 + float(np.max(np.abs(x[name]))))
         amounts.append((amount, f"symmetry of {name}"))
     for name, (low, high) in problem.bounds.items():
-        amount = float(np.max(np.maximum(low - x[name], x[name] - high), initial=0.0)) / _width(problem, x, name)
-        amounts.append((amount, name))
+        width = max([float(np.max(lagrangian.sizes[problem.slices[name]], initial=0.0)), *(
+            float(np.max(np.abs(end[np.isfinite(end)]), initial=0.0)) for end in (low, high))])
+        amounts.append((float(np.max(np.maximum(low - x[name], x[name] - high), initial=0.0)) / width, name))
     violation, worst = largest([*amounts, *((row.excess, row.constraint.name) for row in rows)])
-
-    lagrangian = LagrangianAtPoint.of(problem, x)
     if not np.isfinite(violation):
         rest = Residuals(np.inf, worst, np.inf, np.inf)
         return Judgement(lagrangian.value, rest, {}, False, np.zeros(len(problem.gauged)))
@@ -116,19 +114,13 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
     else:
         best = (np.inf, np.inf) if _size(problem, rows) <= LARGEST else (np.nan, np.nan)
     unsure = rows and not np.isnan(best[0]) and not best[0] <= UNCONFIRMED
-    if unsure and (own := _fitted(problem, x, rows, lagrangian)) is not None:
+    if unsure and (own := _fitted(rows, lagrangian)) is not None:
         again = lagrangian.measure(rows, own)
         if not again[0] >= best[0]:
             given, best, fitted = own, again, True
     named = {} if given is None else join_by_name([row.constraint for row in rows], given)
     return Judgement(lagrangian.value, Residuals(violation, worst, *best), named, fitted,
                      lagrangian.gauge_multipliers(rows, given or ()))
-
-
-def _width(problem: Problem, x: Values, name: str) -> float:
-    """Return the size of an unknown with bounds: its own, or that of a bound."""
-    ends = [float(np.max(np.abs(end[np.isfinite(end)]), initial=0.0)) for end in problem.bounds[name]]
-    return max([variable_size(x[name], problem.space.usual_sizes.get(name)), *ends])
 
 
 def rows_at(problem: Problem, x: Values) -> list[RowsAtPoint]:
@@ -210,6 +202,13 @@ class LagrangianAtPoint:
         """The objective, or that of the zero model where it is larger."""
         return max(abs(self.value), self.problem.scale)
 
+    @cached_property
+    def sizes(self) -> Array:
+        """The size of the unknown (unknowns,) that every component belongs to."""
+        usual = self.problem.space.usual_sizes
+        return np.concatenate([np.full(np.size(self.x[name]), variable_size(self.x[name], usual.get(name)))
+                               for name in self.problem.slices])
+
     def measure(self, rows: Sequence[RowsAtPoint], duals: Sequence[Array]) -> tuple[float, float]:
         """Return stationarity and complementarity with multipliers of the rows."""
         problem, total, terms, products = self.problem, self.gradient.copy(), self.magnitudes.copy(), 0.0
@@ -230,17 +229,13 @@ class LagrangianAtPoint:
         rates = []
         for name, place in problem.slices.items():
             part, effort = self._free_part(name, total[place], terms[place])
-            # relative to the terms it is a sum of, and to the objective per size of the unknown
-            floor = effort + self.yardstick / variable_size(self.x[name], problem.space.usual_sizes.get(name))
-            rates.append((float(np.max(np.abs(part) / np.where(floor > 0, floor, 1.0), initial=0.0)), name))
+            rates.append((float(np.max(np.abs(part) / self.floor(effort, place), initial=0.0)), name))
         # relative to a hundredth of the zero model's objective where the objective vanishes
         return largest(rates)[0], products / max(abs(self.value), 1e-2 * problem.scale, np.finfo(float).tiny)
 
-    def floor(self) -> Array:
-        """Return what the components of the gradient are relative to (unknowns,)."""
-        floor = self.magnitudes.copy()
-        for name, place in self.problem.slices.items():
-            floor[place] += self.yardstick / variable_size(self.x[name], self.problem.space.usual_sizes.get(name))
+    def floor(self, magnitudes: Array, place: slice = slice(None)) -> Array:
+        """Return what components of the gradient are relative to, from the magnitudes of their terms."""
+        floor = magnitudes + self.yardstick / self.sizes[place]  # terms, and the objective per size of the unknown
         return np.where(floor > 0, floor, 1.0)
 
     def gauge_multipliers(self, rows: Sequence[RowsAtPoint], duals: Sequence[Array]) -> Array:
@@ -273,8 +268,7 @@ class LagrangianAtPoint:
         shape = np.shape(self.x[name])
         if name in self.problem.bounds:
             low, high = self.problem.bounds[name]
-            margin = INSIDE * variable_size(self.x[name], self.problem.space.usual_sizes.get(name))
-            value = flat(self.x[name])
+            value, margin = flat(self.x[name]), INSIDE * self.sizes[self.problem.slices[name]]
             down, up = value <= flat(low) + margin, value >= flat(high) - margin
             part = np.where(down & (part > 0) | up & (part < 0), 0.0, part)
         for term in self.problem.terms:
@@ -317,17 +311,14 @@ def in_dual_cone(constraint: Constraint, dual: Array) -> Array:
     return dual if constraint.is_equality else np.maximum(dual, 0.0)
 
 
-def _fitted(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], lagrangian: LagrangianAtPoint
-            ) -> list[Array] | None:
+def _fitted(rows: Sequence[RowsAtPoint], lagrangian: LagrangianAtPoint) -> list[Array] | None:
     """Return the multipliers that leave least of the gradient; None where the iterations do not suffice."""
-    units = np.ones(problem.size)
-    for name, place in problem.slices.items():
-        units[place] = variable_size(x[name], problem.space.usual_sizes.get(name))
+    problem = lagrangian.problem
     if _size(problem, rows) > LARGEST or not np.all(np.isfinite(lagrangian.gradient)):
         return None
     slopes, equal, parts = active_slopes(lagrangian, rows)
     try:
-        weights, _ = fit_multipliers(slopes * units, -lagrangian.gradient * units, equal)
+        weights, _ = fit_multipliers(slopes * lagrangian.sizes, -lagrangian.gradient * lagrangian.sizes, equal)
     except (RuntimeError, ValueError):  # the iterations did not suffice, or products left the range of numbers
         return None
     counts = np.cumsum([len(problem.gauged), *map(len, parts)])

@@ -4,7 +4,7 @@ Every leaf is its own CVXPY variable in the words of the user, so that a constra
 affine; its values and slopes in the unknowns follow by the chain rule.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -217,13 +217,7 @@ class LeafSpace(OwnNumbers):
 
     def rows(self, parts: Mapping[str, Any], count: int) -> Any:
         """Return slopes by some leaves as rows (count, leaves), sparse where there are many entries."""
-        if count * self.size > DENSE:
-            return sp.csr_array(sp.hstack([parts.get(name, sp.csr_array((count, place.stop - place.start)))
-                                           for name, place in self.places.items()]))
-        rows = np.zeros((count, self.size))
-        for name, part in parts.items():
-            rows[:, self.places[name]] = part.toarray() if sp.issparse(part) else part
-        return rows
+        return in_places([(count, parts)], self.places)
 
     def vector(self, y: Values) -> Array:
         """Return values one after another."""
@@ -234,6 +228,21 @@ def variable_size(value: Array, usual: float | None = None) -> float:
     """Return the largest entry of a value or of its start; one where there is no start and nothing but rounding."""
     size = float(np.max(np.abs(value), initial=0.0))
     return max(size, usual) if usual is not None else size if size > ZERO else 1.0
+
+
+def in_places(blocks: Sequence[tuple[int, Mapping[str, Any]]], places: Mapping[str, slice]) -> Any:
+    """Return blocks (rows, their parts by name) as one matrix, each part in its place; sparse with many entries."""
+    height, width = sum(count for count, _ in blocks), sum(place.stop - place.start for place in places.values())
+    if height * width > DENSE:
+        return sp.csr_array(sp.vstack([sp.hstack([
+            parts.get(name, sp.csr_array((count, place.stop - place.start))) for name, place in places.items()])
+            for count, parts in blocks]))
+    found, top = np.zeros((height, width)), 0
+    for count, parts in blocks:
+        for name, part in parts.items():
+            found[top : top + count, places[name]] = part.toarray() if sp.issparse(part) else part
+        top += count
+    return found
 
 
 def slices_of(values: Values) -> dict[str, slice]:

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from optid.arrays import Array
-from optid.core.constraint import Constraint, ConstraintReader
-from optid.core.leaves import DENSE, GAUGE, Affine, Leaf, LeafSpace, Product, positions, slices_of
+from optid.core.constraint import Constraint, read_constraints
+from optid.core.leaves import DENSE, GAUGE, Affine, Leaf, LeafSpace, Product, in_places, positions, slices_of
 from optid.core.terms import Errors, Expressed, Squares, Term, Values, flat
 from optid.errors import StructureError, nearest
 from optid.program.solution import Bound
@@ -148,7 +148,7 @@ class Problem:
     def _shared_with(self, made: "Problem", x: Values, own: int, held: Iterable[Constraint]) -> "Problem":
         """Return a problem made of this one, in whose leaves constraints were read, behind its own first ones."""
         vars(made)["space"] = self.space  # the same leaves of the same usual sizes
-        vars(made)["_at_start"] = (*(made._read(x, set(range(own))) if own else ()),
+        vars(made)["_at_start"] = (*(read_constraints(made, x, range(own)) if own else ()),
                                    *(replace(one, builder=one.builder + own) for one in held))
         return made
 
@@ -264,28 +264,15 @@ class Problem:
 
     def slope(self, x: Values) -> Any:
         """Return the derivative (leaves, unknowns) of all leaves, sparse where it has many entries."""
-        if self.space.size * self.size > DENSE:
-            blocks = {name: {name: sp.eye_array(place.stop - place.start)} for name, place in self.slices.items()}
-            blocks |= {leaf.name: leaf.slope(x) for leaf in self.leaves}
-            sizes = {name: place.stop - place.start for name, place in self.slices.items()}
-            return sp.csr_array(sp.vstack([sp.hstack([
-                parts.get(name, sp.csr_array((self.space.places[leaf].stop - self.space.places[leaf].start, size)))
-                for name, size in sizes.items()]) for leaf in self.space.places for parts in [blocks.get(leaf, {})]]))
-        found = np.zeros((self.space.size, self.size))
-        for name, place in self.slices.items():
-            found[self.space.places[name], place] = np.eye(place.stop - place.start)
-        for leaf in self.leaves:
-            for name, part in leaf.slope(x).items():
-                found[self.space.places[leaf.name], self.slices[name]] = part
-        return found
-
-    def _read(self, x: Values, only: set[int] | None = None) -> list[Constraint]:
-        reader = ConstraintReader(self.name, self.space, self.facts, self.has_convex_terms, self.about)
-        return reader.read(self.restrictions, self.builders, x, self.expressions(self.space.variables, x), only)
+        eye: Any = sp.eye_array if self.space.size * self.size > DENSE else np.eye
+        blocks: dict[str, Any] = {name: {name: eye(place.stop - place.start)} for name, place in self.slices.items()}
+        blocks |= {leaf.name: leaf.slope(x) for leaf in self.leaves}
+        places = self.space.places.items()
+        return in_places([(place.stop - place.start, blocks.get(name, {})) for name, place in places], self.slices)
 
     @cached_property
     def _at_start(self) -> tuple[Constraint, ...]:
-        held = tuple(self._read(self.start)) if self.restrictions or self.builders else ()
+        held = tuple(read_constraints(self, self.start)) if self.restrictions or self.builders else ()
         if self.gauged and any(one.name == GAUGE for one in held):
             raise StructureError(f"there are two constraints named {GAUGE!r}; give each its own name")
         return held
@@ -301,9 +288,9 @@ class Problem:
             return self._at_start
         point = self.pack(x).tobytes()
         if point not in self._read_about:  # the last one alone is kept
-            kept = (one for one in self._at_start if one.builder not in moving)
+            held = [one for one in self._at_start if one.builder not in moving] + read_constraints(self, x, moving)
             self._read_about.clear()
-            self._read_about[point] = tuple(sorted([*kept, *self._read(x, moving)], key=lambda one: one.builder))
+            self._read_about[point] = tuple(sorted(held, key=lambda one: one.builder))
         return self._read_about[point]
 
     @cached_property

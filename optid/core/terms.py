@@ -140,26 +140,6 @@ class Length:
 
 
 @dataclass(frozen=True, eq=False)
-class Inner:
-    """``sum of weights · leaf``, linear."""
-
-    weights: Mapping[str, Array]
-
-    def value(self, y: Values) -> float:
-        """Return the value at values of the leaves."""
-        return float(sum(flat(weights) @ flat(y[name]) for name, weights in self.weights.items()))
-
-    def pull(self, y: Values) -> Pull:
-        """Return value and gradient."""
-        weights = {name: flat(one).astype(float) for name, one in self.weights.items()}
-        return Pull(self.value(y), weights, {name: np.abs(one) for name, one in weights.items()})
-
-    def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
-        """Return the term in CVXPY expressions of the leaves."""
-        return sum_of([cp.sum(cp.multiply(weights, v[name])) for name, weights in self.weights.items()])
-
-
-@dataclass(frozen=True, eq=False)
 class NuclearNorms:
     """``sum of weight ‖leaf‖_*``: kinks where a leaf loses rank. A negative weight is a `StructureError`."""
 
@@ -251,7 +231,7 @@ class Errors:
 
 @dataclass(frozen=True, eq=False)
 class Expressed:
-    """Any scalar expression of CVXPY's atoms, smooth or with kinks.
+    """Any scalar expression of CVXPY's atoms: linear, smooth or with kinks.
 
     Attributes:
         build: leaves by name, as expressions -> the expression.

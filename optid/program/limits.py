@@ -1,6 +1,6 @@
 """The bound of a user's constraint: the rows that move with it, their rates, and a small step of it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -96,48 +96,3 @@ def _limit(name: str, member: Any) -> Limit:
     if isinstance(member, SOC):  # in rows, with one multiplier each
         member = cp.norm(member.args[1], 2, axis=None if member.args[1].ndim < 2 else member.axis) <= member.args[0]
     return member if isinstance(member, Limit) else Limit.of(member)
-
-
-def slope_of(limits: Sequence[Limit], places: Sequence[slice], steps: Sequence[float], multipliers: np.ndarray,
-             least: Callable[[np.ndarray], np.ndarray] | None = None) -> tuple[float, int]:
-    """Return the derivative of the objective by the most expensive bound of a constraint, and its limit's position.
-
-    Bounds are compared by what a small step of each gains. The multipliers are those of the rows as they are scaled,
-    flat, each limit in its place, per unit of the objective; `least` returns, for an effect of them, others with the
-    least.
-    """
-    totals, effects = {}, dict[Any, np.ndarray]()
-    for limit, span in zip(limits, places) if least is not None else ():
-        if limit.bound is not None and limit.band is None and isinstance(limit.member, EQUALITIES | INEQUALITIES):
-            effects.setdefault(limit.bound, np.zeros_like(multipliers))[span] = limit.speeds() / limit.sizes
-    said = {name: least(effect) for name, effect in effects.items()} if least is not None else {}
-    for number, (limit, span) in enumerate(zip(limits, places)):
-        part = said.get(limit.bound, multipliers)[span]
-        cone = not isinstance(limit.member, EQUALITIES | INEQUALITIES)
-        if cone and not isinstance(limit.shift, np.ndarray | cp.Expression):
-            totals[number] = float(np.max(np.abs(part), initial=0.0)), number
-            continue
-        part = part if cone else part / limit.sizes
-        if limit.band is not None and limit.span is not None:
-            totals[number] = _band_slope(part, limit.band, limit.span), number
-        elif limit.bound is None:
-            totals[number] = float(np.max(np.abs(part * limit.speeds()), initial=0.0)), number
-        else:
-            before = totals.get(limit.bound, (0.0, number))[0]
-            totals[limit.bound] = before + float(part @ limit.speeds()), number
-    value, number = max(totals.values(), key=lambda one: abs(one[0]) * steps[one[1]])
-    return abs(value), number
-
-
-def _band_slope(multipliers: np.ndarray, band: np.ndarray, span: np.ndarray) -> float:
-    """Gain per unit of t where ``span @ x = 0`` is replaced by ``|band @ x| <= t``, over the columns of x."""
-    from scipy.optimize import linprog
-
-    columns, weights = multipliers.reshape(-1, len(span)), band @ np.linalg.pinv(span)
-    if len(band) == len(span):
-        return float(np.sum(np.abs(np.linalg.solve(weights.T, columns.T))))
-    total, rows = 0.0, np.vstack([weights, -weights])
-    for column in columns:  # the most that the multipliers gain over all x inside the band, in coordinates span @ x
-        found = linprog(-column, A_ub=rows, b_ub=np.ones(len(rows)), bounds=(None, None))
-        total += -float(found.fun) if found.status == 0 else np.nan
-    return total

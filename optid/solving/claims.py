@@ -1,6 +1,7 @@
-"""What a solver's answer is worth: its claim is held against multipliers, bounds and proofs of our own."""
+"""Ask a back end, and say what its answer is worth: its claim is held against multipliers, bounds and proofs."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -8,23 +9,75 @@ import numpy as np
 from optid.arrays import LARGEST
 from optid.backends.back_end import Answer, BackEnd, Settings
 from optid.backends.choice import find
-from optid.certificate.convex import TANGENT
+from optid.certificate.convex import TANGENT, certify_convex
+from optid.certificate.dual_points import certify_groups, certify_low_rank
 from optid.certificate.infeasibility import satisfiable
+from optid.certificate.lifting import certify_nuclear, certify_rank_one
+from optid.core.group_sparse import GroupSparseForm
 from optid.core.judge import judge
 from optid.core.least_squares import RankOneForm
 from optid.core.leaves import GAUGE
+from optid.core.low_rank import LowRankForm
 from optid.core.problem import Problem
-from optid.core.statement import class_of, complete_values, statement_of
-from optid.core.terms import Squares, Values
+from optid.core.statement import class_of, complete_values, is_stated, statement_of
+from optid.core.terms import NuclearNorms, Squares, Values
+from optid.errors import SolverRefused, StructureError
+from optid.packing import Unsendable
+from optid.processes import run_apart
+from optid.program.expressions import is_crash
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, relative_gap, tolerance
-from optid.solving.answers import answer_of
-from optid.solving.proofs import proof_of
+from optid.structures.rank_one import RankOne
 
+GRACE = 0.5  # seconds after its time limit at which a solver is killed
 FALSE_CLAIM = 1e-3  # a claim of success at a point this far outside the constraints is false, not inaccurate
 REFERENCE = "clarabel"  # the solver that is asked where neither multipliers nor a bound confirm a point
 OPEN = 1e-8  # relative gap that a proof leaves, above which a back end is asked to search further
 CONFLICT = "the constraints contradict each other"
 NOT_FINITE = "returned non-finite numbers"  # the reason of such a solution, after its solver
+
+
+def answer_of(problem: Problem, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
+    """Run a back end from the programme's start, in another process where it is to be separate; every outcome counts.
+
+    What only models and proofs need may stay here (`optid.packing.Absent`).
+    """
+    if is_stated(problem) or separate or not settings.warm:
+        statement_of(problem).begin(problem.start if settings.warm else {})
+    if not separate:
+        return _run(back_end, problem, settings)
+    clock = time.monotonic()
+    try:
+        limit = None if settings.time_limit is None else settings.time_limit + GRACE
+        return run_apart(_run, back_end, problem, settings, seconds=limit, lenient=True)
+    except TimeoutError:
+        return Answer(Status.LIMIT, f"stopped after {time.monotonic() - clock:.1f} s: it did not keep its time limit")
+    except ChildProcessError as death:
+        return Answer(Status.FAILED, f"the solver's process died: {death}")
+    except Unsendable as refusal:
+        raise SolverRefused(f"a separate process for {back_end.name!r} is not possible: {refusal}; or use neither "
+                            "time_limit nor isolate") from refusal
+
+
+def _run(back_end: BackEnd, problem: Problem, settings: Settings) -> Answer:
+    """Run a back end; its own exception is an answer, too, also in a child."""
+    try:
+        return _wellformed(back_end.run(problem, settings), problem)
+    except Unsendable:
+        raise
+    except StructureError as refusal:  # its message has the remedy for the user
+        raise SolverRefused(str(refusal)) from refusal
+    except BaseException as error:  # a solver that crashes is an outcome, not a traceback
+        if not is_crash(error):
+            raise
+        return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
+
+
+def _wellformed(answer: Answer, problem: Problem) -> Answer:
+    """Return an answer with the values of the programme's variables; one of another form is a failure."""
+    if not isinstance(answer, Answer) or not isinstance(answer.status, Status) or not all(
+            isinstance(one, Mapping) for one in (answer.values, answer.duals)):
+        return Answer(Status.FAILED, "it returned no Answer(status: Status, word, values: Mapping, duals: Mapping)")
+    return replace(answer, values={name: value for name, value in answer.values.items() if name in problem.shapes})
 
 
 def verdict(problem: Problem, back_end: BackEnd, answer: Answer, base: Solution, settings: Settings, prove: bool,
@@ -98,7 +151,8 @@ def _judged(problem: Problem, answer: Answer, base: Solution) -> Solution:
 
     Where the solver's multipliers do not make it stationary, those count that come nearest to it.
     """
-    duals = _usable(answer.duals)
+    flattened = {name: np.ravel(np.asarray(part, dtype=float)) for name, part in answer.duals.items()}
+    duals = {name: part for name, part in flattened.items() if np.all(np.isfinite(part))}
     x = {name: np.reshape(np.asarray(answer.values[name], dtype=float), np.shape(start), order="F")
          for name, start in problem.start.items()}
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
@@ -134,12 +188,6 @@ def _confirmed(problem: Problem, back_end: BackEnd, settings: Settings, point: S
         settings.accuracy)
 
 
-def _usable(duals: Values) -> dict[str, np.ndarray]:
-    """Return the multipliers that are finite numbers."""
-    flat = {name: np.ravel(np.asarray(part, dtype=float)) for name, part in duals.items()}
-    return {name: part for name, part in flat.items() if np.all(np.isfinite(part))}
-
-
 def _stationary(residuals: Residuals, accuracy: float) -> bool:
     """Whether a point is stationary as far as was measured; not where that is not known."""
     limit = tolerance(accuracy)
@@ -161,7 +209,7 @@ def _without_point(problem: Problem, answer: Answer, back_end: BackEnd, settings
         if judge(problem, problem.start, {}).residuals.violation < 1e-9:
             return Status.FAILED, f"{name} claims infeasibility, but the start satisfies every constraint"
     if answer.status is Status.INFEASIBLE and satisfiable(problem, list(problem.constraint_names)):
-        if _refutable(problem):
+        if all(one.limit.member.is_dcp() for one in problem.constraints()):  # the relaxation is exact
             return Status.FAILED, f"{name} claims infeasibility, but no constraints contradict each other"
         if class_of(problem) == "NLP":  # descents end where they can't go on, and say this of any place
             return Status.FAILED, f"{name} claims infeasibility, which no convex relaxation of the constraints confirms"
@@ -174,11 +222,6 @@ def _without_point(problem: Problem, answer: Answer, back_end: BackEnd, settings
         if found is not None and found.status is Status.OPTIMAL:
             return Status.FAILED, f"{name} claims that there is no minimum, but {REFERENCE} finds one"
     return answer.status, answer.word
-
-
-def _refutable(problem: Problem) -> bool:
-    """Whether a point that satisfies a convex outer approximation of the constraints satisfies them all."""
-    return all(one.limit.member.is_dcp() for one in problem.constraints())
 
 
 def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) -> tuple[Status, str]:
@@ -239,3 +282,29 @@ def _lowered(problem: Problem, start: Values, back_end: BackEnd, settings: Setti
         if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
             point, bound = again, proof_of(problem, again.values, again.duals)[0] or bound
     return point, bound
+
+
+def proof_of(problem: Problem, values: Values, duals: Values) -> tuple[Bound | None, Values | None]:
+    """Return a bound on the objective from a point and its multipliers, and a better start that the attempt proposes.
+
+    No bound where the problem is not convex and nothing is known of its terms, or where none can be formed.
+    """
+    x = {name: np.asarray(values[name], dtype=float) for name in problem.start}
+    if problem.no_proof:
+        return Bound.none(problem.no_proof), None
+    if callable(problem.proof):
+        return problem.proof(problem, x, duals)
+    if RankOneForm.of(problem) is not None:
+        return certify_rank_one(problem, x)
+    if (groups := GroupSparseForm.of(problem)) is not None:
+        return certify_groups(problem, groups, x, duals), None
+    if (matrix := LowRankForm.of(problem)) is not None:
+        return certify_low_rank(problem, matrix, x, duals), None
+    match problem.terms:
+        case (Squares(lifted=RankOne(), z=z), NuclearNorms()) if z == tuple(problem.start):
+            return certify_nuclear(problem, x, duals), None
+    kind = class_of(problem)
+    try:
+        return (None if kind == "NLP" else certify_convex(problem, x, duals, kind == "QP")), None
+    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+        return None, None

@@ -1,7 +1,7 @@
 """Solve a programme: look the solver up, refuse what it cannot take, run it, judge its point, prove it."""
 
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,8 +12,7 @@ from optid.core.statement import complete_values, for_solvers
 from optid.errors import SolverRefused
 from optid.processes import LONGEST
 from optid.program.solution import Bound, Solution, Status, Times
-from optid.solving.answers import answer_of
-from optid.solving.claims import FALSE_CLAIM, verdict
+from optid.solving.claims import FALSE_CLAIM, answer_of, verdict
 from optid.solving.steps import Solvers
 from optid.threads import one_thread
 
@@ -91,16 +90,6 @@ def solve(problem: Problem, solver: str | BackEnd | Callable = "auto", *, accura
         found = attempt(back_end, sharper, chosen, solution.times.solve)
         return found if found.status in (Status.LOCAL, Status.OPTIMAL) else solution
     return solution
-
-
-def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
-    """State how many programmes another back end than the one chosen first has solved."""
-    replaced = [solution for _, solution in steps if solution.failed]
-    if not replaced:
-        return {}
-    first, others = replaced[0].failed, ", ".join(dict.fromkeys(solution.solver for solution in replaced))
-    return {"solver fallback": f"{first} gave no usable answer for {len(replaced)} of {len(steps)} programmes, which "
-                               f"{others} solved"}
 
 
 @dataclass(frozen=True)
@@ -200,15 +189,18 @@ def run(problem: Problem | Procedure, solver: Any = "auto", *, options: Mapping[
     evidence = found if isinstance(found, Evidence) else None
     program, solution = last[evidence.main if evidence else ""]
     solution = replace(solution, times=replace(solution.times, build=building))
-    if evidence is None:
-        return Outcome(found, solution, program, tuple(steps), _substitutions(steps), constrained)
-    bound = None if callable(evidence.bound) else evidence.bound
-    solution = replace(solution, objective=evidence.objective, bound=bound, status=evidence.status,
-                       reason=evidence.reason)
-    if evidence.values is not None:
-        solution = replace(solution, values=complete_values(program, evidence.values))
-    figures = {**evidence.figures, **_substitutions(steps)}
-    return Outcome(evidence.model, solution, program, tuple(steps), figures, constrained, evidence)
+    if evidence is not None:
+        bound = None if callable(evidence.bound) else evidence.bound
+        values = solution.values if evidence.values is None else complete_values(program, evidence.values)
+        solution = replace(solution, objective=evidence.objective, bound=bound, status=evidence.status,
+                           reason=evidence.reason, values=values)
+        found = evidence.model
+    figures = dict(evidence.figures) if evidence else {}
+    if replaced := [one for _, one in steps if one.failed]:
+        others = ", ".join(dict.fromkeys(one.solver for one in replaced))
+        figures["solver fallback"] = (f"{replaced[0].failed} gave no usable answer for {len(replaced)} of {len(steps)} "
+                                      f"programmes, which {others} solved")
+    return Outcome(found, solution, program, tuple(steps), figures, constrained, evidence)
 
 
 def _alone(problem: Problem) -> Procedure:

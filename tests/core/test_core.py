@@ -15,7 +15,7 @@ from optid.core.judge import judge
 from optid.core.leaves import Product, Quantity
 from optid.core.problem import Problem
 from optid.core.statement import class_of, for_solvers, statement_of
-from optid.core.terms import Errors, GroupNorms, Inner, Length, NuclearNorms, Squares, flat
+from optid.core.terms import Errors, Expressed, GroupNorms, Length, NuclearNorms, Squares, flat
 from optid.errors import StructureError
 from optid.identify.equation_error import EquationStructure, compress
 from optid.program.solution import Status
@@ -36,9 +36,9 @@ def terms(seed):
     """Every smooth term over the leaves."""
     rng = np.random.default_rng(seed)
     root, target = rng.normal(size=(9, 15)), rng.normal(size=9)
-    z = ("Q", "a", "c")
+    matrix, vector, z = rng.normal(size=(3, 4)), rng.normal(size=2), ("Q", "a", "c")
     return {"squares": Squares(root, target, 0.3, z), "length": Length(root, target, z),
-            "inner": Inner({"Q": rng.normal(size=(3, 4)), "a": rng.normal(size=2)}),
+            "linear": Expressed(lambda v: cp.sum(cp.multiply(matrix, v["Q"])) + vector @ v["a"]),
             "errors": Errors(lambda y: Squares(root, target, 0.3, z), lambda y: Squares(root, target, 0.3, z).value(y))}
 
 

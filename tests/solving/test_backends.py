@@ -125,8 +125,7 @@ def translated(expression: cp.Expression):
     problem = cp.Problem(cp.Minimize(cp.sum(cp.multiply(weights, expression))))
     form = smooth(problem)
     parts = casadi_backend.translate(form)
-    function = ca.Function("f", [parts["x"], parts["p"]], [parts["f"], parts["g"]])
-    value, rows = function(form.start(), form.parameter_values())
+    value, rows = ca.Function("f", [parts["x"]], [parts["f"], parts["g"]])(form.start())
     known = float(np.ravel(weights, order="F") @ np.ravel(expression.value, order="F"))
     return float(value), known, np.asarray(rows).ravel()
 
@@ -137,13 +136,15 @@ v, w, s = cp.Variable(4, name="v"), cp.Variable(3, name="w"), cp.Variable(name="
 X.value, Y.value = rng.uniform(0.5, 1.5, (3, 4)), rng.uniform(0.5, 1.5, (4, 2))
 v.value, w.value, s.value = rng.uniform(0.5, 1.5, 4), rng.uniform(0.5, 1.5, 3), 0.7
 P = cp.Parameter((3, 3), value=rng.standard_normal((3, 3)), name="P")
+N = cp.Parameter(4, nonneg=True, value=rng.uniform(0.5, 1.5, 4), name="N")
 Q = rng.standard_normal((4, 4))
 ATOMS = {
     "add": X + X[0:1, :] + 1, "neg": -X, "scalar times": s * X, "elementwise": cp.multiply(X, 2 * X),
     "broadcast": cp.multiply(X, cp.reshape(v, (1, 4), order="F")),
     "matmul": X @ Y, "matrix vector": X @ v, "vector matrix": w @ X, "inner": v @ v, "constant left": Q @ v,
     "constant right": v @ Q, "sparse": sp.csc_array(np.diag([1.0, 0, 2, 3])) @ v,
-    "parameter": P @ X, "outer": cp.outer(w, v), "divided by a constant": X / -2.0, "divided": v / (1 + s),
+    "parameter": P @ X, "entropy to parameters": cp.rel_entr(v, N), "over a parameter": cp.quad_over_lin(v, N[0]),
+    "outer": cp.outer(w, v), "divided by a constant": X / -2.0, "divided": v / (1 + s),
     "power 2": X**2, "power 3": v**3, "power -1": v**-1, "square root": cp.sqrt(v), "sum squares": cp.sum_squares(X),
     "sum squares of columns": cp.sum_squares(X, axis=0), "quad over lin": cp.quad_over_lin(v, 2.0),
     "quad form": cp.quad_form(v, Q @ Q.T), "sum": cp.sum(X), "sum of rows": cp.sum(X, axis=1),

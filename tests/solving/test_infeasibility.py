@@ -13,7 +13,7 @@ from formulations.constraints import shape
 from optid.certificate.infeasibility import conflicting_subset, explain, satisfiable
 from optid.core.problem import Problem
 from optid.core.statement import for_solvers
-from optid.core.terms import Inner
+from optid.core.terms import Expressed
 from optid.errors import InfeasibleError, UnboundedError
 
 SETS = {
@@ -78,7 +78,7 @@ def test_what_can_be_satisfied_is_not_blamed():
 
 def test_an_unbounded_programme_says_so():
     def falling(data):
-        return Problem("falling", {"x": np.zeros(1)}, (Inner({"x": np.ones(1)}),),
+        return Problem("falling", {"x": np.zeros(1)}, (Expressed(lambda v: v["x"][0]),),
                        restrictions=(lambda v: {"cap": v["x"] <= 1},))
 
     refuses(UnboundedError, "'falling' has no minimum", optid.fit, record(), falling)

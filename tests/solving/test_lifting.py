@@ -11,7 +11,7 @@ from optid.certificate.lifting import lift
 from optid.core.least_squares import RankOneForm
 from optid.core.statement import for_solvers, statement_of
 from optid.registry import formulation
-from optid.solving.proofs import proof_of
+from optid.solving.claims import proof_of
 
 SETS = {
     "cone": [shape.monotone()],

@@ -155,7 +155,7 @@ def test_7_sqpmethod_indeed_does_not_pass():
              "error_on_fail": False, "qpsol": "qrqp", "max_iter": 50,
              "qpsol_options": {"print_iter": False, "print_header": False, "error_on_fail": False}}
     solver = ca.nlpsol("s", "sqpmethod", casadi_backend.translate(form), quiet)
-    found = solver(x0=form.start(), p=[], lbg=form.row_bounds[0], ubg=form.row_bounds[1])
+    found = solver(x0=form.start(), lbg=form.row_bounds[0], ubg=form.row_bounds[1])
     assert not solver.stats()["success"] or float(found["f"]) > 1.01 * case("rank_one_fit").value
 
 

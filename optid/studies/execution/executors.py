@@ -33,7 +33,7 @@ from optid.child import limit_memory
 from optid.errors import StudyError
 from optid.packing import Unsendable, pack
 from optid.processes import LONGEST, Worker, start_workers
-from optid.solving.answers import GRACE
+from optid.solving.claims import GRACE
 from optid.studies.execution import cell as cells
 from optid.studies.execution.cell import lost_row, prepare, run_cell, versions_of, without_warm
 from optid.studies.execution.machine import MB, resident_mb
