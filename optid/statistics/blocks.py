@@ -71,7 +71,7 @@ class BlockSignals:
         if not self.local:
             return np.ones(len(weights)) @ weights
         places = self.first[samples, None] + np.arange(weights.shape[1])
-        return np.bincount(places.ravel(), weights.ravel(), self.size)
+        return np.asarray(np.bincount(places.ravel(), weights.ravel(), self.size), dtype=float)
 
 
 @dataclass(frozen=True)
