@@ -62,30 +62,30 @@ def options(settings: Settings) -> dict[str, Any]:
 
 
 def _model(unopy: Any, form: Smooth) -> Any:
-    start, engine = form.start(), Derivatives(form)
+    start, derivatives = form.start(), Derivatives(form)
     model = unopy.Model(unopy.PROBLEM_NONLINEAR, start.size, *form.bounds, unopy.ZERO_BASED_INDEXING)
 
     def objective(x: Any) -> float:
-        engine.at(x)
-        return engine.value
+        derivatives.at(x)
+        return derivatives.value
 
     def rows(x: Any, out: np.ndarray) -> None:
-        engine.at(x)
-        out[:] = engine.rows
+        derivatives.at(x)
+        out[:] = derivatives.rows
 
-    def derivative(x: Any, out: np.ndarray, kind: str) -> None:
-        out[:] = getattr(engine.at(x), kind)(np.asarray(x))
+    def slope(x: Any, out: np.ndarray, kind: str) -> None:
+        out[:] = getattr(derivatives.at(x), kind)(np.asarray(x))
 
     def hessian(x: Any, factor: float, multipliers: Any, out: np.ndarray) -> None:
-        out[:] = engine.at(x).hessian(np.asarray(x), np.asarray(multipliers), factor)
+        out[:] = derivatives.at(x).hessian(np.asarray(x), np.asarray(multipliers), factor)
 
-    model.set_objective(unopy.MINIMIZE, objective, partial(derivative, kind="gradient"))
+    model.set_objective(unopy.MINIMIZE, objective, partial(slope, kind="gradient"))
     row_lower, row_upper = form.row_bounds
     if row_lower.size:
-        row, column = engine.engine.jacobianstructure()
+        row, column = derivatives.engine.jacobianstructure()
         model.set_constraints(row_lower.size, rows, row_lower, row_upper, len(row), row, column,
-                              partial(derivative, kind="jacobian"))
-    row, column = engine.engine.hessianstructure()
+                              partial(slope, kind="jacobian"))
+    row, column = derivatives.engine.hessianstructure()
     model.set_lagrangian_hessian(len(row), unopy.LOWER_TRIANGLE, row, column, hessian)
     model.set_lagrangian_sign_convention(unopy.MULTIPLIER_POSITIVE)
     model.set_initial_primal_iterate(start)

@@ -76,8 +76,8 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
         records = [e.y[:, o] for e in data.experiments]
         y = _present("output", name, records)
         found += _outliers("output", name, records, arguments)
-        level = float(np.mean(y))
-        size, level = float(np.linalg.norm(y - level)) / np.sqrt(y.size), abs(level)
+        mean = float(np.mean(y))
+        size, level = float(np.linalg.norm(y - mean)) / np.sqrt(y.size), abs(mean)
         digits = -np.log10(np.finfo(float).eps * max(level / size, 1.0))
         if digits < FEW_DIGITS:
             found.append(f"output {name!r} varies by {size:.1e} around {level:.1e}, which leaves {digits:.1f} decimal "

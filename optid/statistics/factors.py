@@ -40,11 +40,11 @@ def root_of_gram(gram: Array, n: int) -> Array:
         root[:sound, sound:] = dtrtrs(inner[:sound, :sound], scaled[:sound, sound:], trans=1)[0]
     if n < len(gram):
         remainder = scaled[n:, n:] - root[:n, n:].T @ root[:n, n:]
-        if len(remainder) == 1:
+        if len(remainder) == 1:  # the usual case, for which two decompositions take as long as all the rest
             root[n, n] = np.sqrt(np.maximum(remainder[0, 0], 0.0))
-            return _nonnegative_diagonal(root) * scale
-        values, vectors = np.linalg.eigh(remainder)
-        root[n:, n:] = np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r")
+        else:
+            values, vectors = np.linalg.eigh(remainder)
+            root[n:, n:] = np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r")
     return _nonnegative_diagonal(root) * scale
 
 

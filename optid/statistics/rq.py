@@ -97,6 +97,6 @@ def rq(statistics: HankelStatistics, instruments: Sequence[int] | NDArray[np.int
     else:
         _, values, right = np.linalg.svd(scaled, full_matrices=True)
         kept = int(np.sum(values > tolerance * values[0]))
-        condition = float(np.linalg.cond(scaled))
+        condition = float(values[0] / values[-1]) if values[-1] else np.inf
         r22, discarded = l31 @ right[kept:].T, phi.size - kept
     return RQ(r22, residual.T, condition, discarded, triangle[: z.size, : z.size], (l21, l31))

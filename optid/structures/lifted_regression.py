@@ -68,9 +68,6 @@ def leading_pairs(core: Core, thetas: Sequence[Array], whitened: bool = True) ->
     """
     pairs = []
     for c, theta in enumerate(thetas):
-        if len(theta) == 1:
-            pairs.append((np.ones(1), theta[0]))
-            continue
         of_mu, of_b = np.eye(theta.shape[0]), np.eye(theta.shape[1])
         if whitened and c in core.kept:
             position = core.kept.index(c)

@@ -254,6 +254,15 @@ def test_refusals(data, arguments, error, text):
     refuses(error, text, quiet, data, "hammerstein_ss.asivid", **arguments)
 
 
+@pytest.mark.parametrize("method", ["hammerstein_ss.sid", "hammerstein_ss.sivid", "subspace.nuclear"])
+@pytest.mark.parametrize("offset", [True, False])
+@pytest.mark.parametrize("change, text", [
+    (lambda u, y: (u[:, :1] * [1, 2] + [0, 1], y), "input 'u2' is a sum of multiples of u1"),
+    (lambda u, y: (u, y[:, :1] * [1, -3]), "output 'y2' is a sum of multiples of y1")])
+def test_channels_that_depend_on_others_are_named_in_linear_models_too(method, offset, change, text):
+    refuses(RankError, text, quiet, broken(change), method, basis="linear", nx=3, block_rows=6, offset=offset)
+
+
 def test_nearly_linear_feedback_is_refused_or_warned_of():
     data = broken(lambda u, y: (u, 1e-4 * y))
     with pytest.raises(RankError, match="cannot be distinguished from an output injection"):

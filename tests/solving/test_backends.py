@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import cvxpy as cp
 import numpy as np
@@ -282,3 +283,11 @@ def test_a_solver_writes_nothing_to_standard_output(capfd):
             "print('done')\n")
     subprocess.run([sys.executable, "-c", code], check=True)
     assert capfd.readouterr().out == "done\n"
+
+
+@pytest.mark.parametrize("courses, options, limit", [
+    ((), {}, casadi_backend.LIMIT), (("x",), {}, casadi_backend.FAR), (("x",), {"max_iter": 3000}, 3000),
+    (("x",), {"ipopt.max_iter": casadi_backend.LIMIT}, casadi_backend.LIMIT)])
+def test_the_limit_of_iterations_is_that_of_the_user_where_there_is_one(courses, options, limit):
+    problem = SimpleNamespace(scale=1.0, settled=False, courses=courses)
+    assert casadi_backend.options("ipopt", problem, Settings(options=options))["ipopt.max_iter"] == limit

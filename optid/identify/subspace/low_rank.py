@@ -20,6 +20,7 @@ from optid.identify.validation.predictions import MEASURED, SIMULATION, predicti
 from optid.program.solution import Solution, Status
 from optid.program.units import energy_unit
 from optid.solving.solve import Evidence, Procedure
+from optid.statistics.expansion import check_channels
 from optid.structures.nuclear_norm import KnownSignals, NuclearProblem, window_starts
 
 Values = Mapping[str, Array]
@@ -195,10 +196,11 @@ def held_out_fit(model: Any, data: Data) -> float:
 def structure(plan: Plan) -> Structured:
     """Build the structured problem of the record of a plan, whose instruments word is the form.
 
-    Feedback in a form other than "predictor", a record too long (`StructureError`) and too few usable windows
-    (`RankError`) are refused.
+    Feedback in a form other than "predictor", a record too long (`StructureError`), too few usable windows and channels
+    that depend on others (`RankError`) are refused.
     """
     windows = Windows.of(plan)
+    check_channels(plan.records, plan.data.inputs, plan.data.outputs)
     expansion, alpha, form = windows.expansion, windows.alpha, plan.instruments
     l = expansion.l  # noqa: E741
     if form != "predictor" and expansion.q:

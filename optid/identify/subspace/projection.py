@@ -71,10 +71,10 @@ def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, 
     """
     statistics = hankel_statistics(records, 2 * block_rows, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
-    x = expansion
-    if statistics.method == "qr" or not all(isinstance(basis, Linear) for basis in x.inputs):
-        # where all signals are channels, one that depends on others makes the windows all but singular
-        check_channels([record[:, : x.m + x.l] for record in records], x.input_names, x.output_names)
+    # where all signals are channels, one that depends on others makes the windows all but singular
+    if statistics.method == "qr" or not all(isinstance(basis, Linear) for basis in expansion.inputs):
+        channels = [record[:, : expansion.m + expansion.l] for record in records]
+        check_channels(channels, expansion.input_names, expansion.output_names)
     statistics.check()
     if statistics.windows < KEPT * statistics.candidates:
         warnings.warn(f"missing samples leave {statistics.windows} of {statistics.candidates} windows of "

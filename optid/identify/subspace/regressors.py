@@ -111,7 +111,7 @@ class ObserverForm:
         x = self.expansion
         chunk = min(CHUNK, max(64, HELD // (self.l * self.n * (x.p + 2 * x.q + self.l + 1))))
         starts = range(0, len(run), chunk)
-        signals = 1 + x.p + x.q * (2 if self.extra else 1) + (1 + self.l) * self.injected
+        signals = 1 + x.p + x.q * (2 if self.extra else 1) + (1 + self.l) * self.injected  # of `_signals`
         state = np.zeros((self.l, signals, self.n))
         state[:, 0] = self.c  # C_o F^k, the effect of x0
         responses = adjoint_responses(self.a - self.gain @ self.c, self.c, state,
