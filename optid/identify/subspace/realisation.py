@@ -64,7 +64,9 @@ class Realisation:
     def ratios(self) -> dict[str, float]:
         """Return the second over the first singular value of every channel's unrestricted matrix."""
         found = {}
-        for i, (name, theta) in enumerate(zip(self.form.channels, self.form.thetas(self.least_squares()))):
+        several = any(min(shape) > 1 for shape in self.form.blocks)
+        thetas = self.form.thetas(self.least_squares()) if several else []
+        for i, (name, theta) in enumerate(zip(self.form.channels, thetas)):
             if min(theta.shape) > 1:
                 values = np.linalg.svd(theta, compute_uv=False)
                 name = name if i >= self.form.expansion.m else f"channel {name}"
